@@ -153,7 +153,6 @@ def repair(
         from amrepair.report.text import left_out_lines
         from amrepair.template import open_template
         from amrepair.turning import turns_named, turns_of
-        from gcode.cli.words import what_it_does
 
     turns = turns_named(turn or [])
     refuse_standing(standing)
@@ -239,24 +238,15 @@ def repair(
     if as_json:
         console.show_json(result)
     else:
-        for line in summary_of_result(result, within_tolerance=within):
+        for line in (
+            *summary_of_result(result, within_tolerance=within),
+            *_taken_for_granted(result),
+            *(f"Left out, {line}." for line in left_out_lines(plan)),
+            *_written(plan, output, within=within, older=older),
+            *_suggestion(plan, ranked),
+            *(f"Left open inside: {line}." for line in (late.told if late is not None else ())),
+        ):
             console.out.print(line)
-        for line in _taken_for_granted(result):
-            console.out.print(line)
-        for line in left_out_lines(plan):
-            console.out.print(f"Left out, {line}.")
-        if program is not None and plan.estimate is not None:
-            does = what_it_does(program, plan.estimate)
-            console.out.print(f"Repair: {output}: {does}.")
-        elif not within:
-            console.out.print(f"{output} was not written: no bead can be laid.")
-        if older:
-            said = f"The {output} that was there is removed: it was for another scan."
-            console.out.print(said)
-        for line in _suggestion(plan, ranked):
-            console.out.print(line)
-        for line in late.told if late is not None else ():
-            console.out.print(f"Left open inside: {line}.")
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
 
@@ -272,6 +262,20 @@ def _damage_at(text: str | None, scan_frame: str) -> tuple[float, float] | None:
         )
     x_mm, y_mm = numbers(text, 2, "--damage-at")
     return float(x_mm), float(y_mm)
+
+
+def _written(plan: RepairPlan, output: Path, *, within: bool, older: bool) -> list[str]:
+    """What became of the file that was to be written; `older`: one was there and is removed."""
+    from gcode.cli.words import what_it_does
+
+    lines = []
+    if plan.checked is not None and plan.estimate is not None:
+        lines.append(f"Repair: {output}: {what_it_does(plan.checked.program, plan.estimate)}.")
+    elif not within:
+        lines.append(f"{output} was not written: no bead can be laid.")
+    if older:
+        lines.append(f"The {output} that was there is removed: it was for another scan.")
+    return lines
 
 
 def _foot_z_mm(template: Template, plan: RepairPlan) -> float:

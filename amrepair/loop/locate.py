@@ -23,7 +23,7 @@ from amrepair.template.port import Template
 from gcode.progress import Progress, silent
 from gcode.reader import Beads, Job
 from gcode.stretches import places_along
-from gcode.surfaces.lines import near_lines
+from gcode.surfaces.lines import columns_around, near_lines
 
 # Names of the outermost bead: PrusaSlicer and SuperSlicer, OrcaSlicer and Bambu, Cura and
 # ideaMaker, Simplify3D, KISSlicer.
@@ -184,12 +184,10 @@ def _things(
     start_mm: Float[np.ndarray, "n 2"], end_mm: Float[np.ndarray, "n 2"], half_mm: float
 ) -> Int[np.ndarray, " n"]:
     """(n,) to which of the connected things, seen from above, each bead belongs; as they begin."""
-    low = np.minimum(start_mm, end_mm).min(axis=0) - 2.0
-    high = np.maximum(start_mm, end_mm).max(axis=0) + 2.0
-    nx, ny = (int(v) for v in np.ceil((high - low) / THING_CELL_MM))
+    low, shape = columns_around(start_mm, end_mm, 2.0, THING_CELL_MM)
     covered = near_lines(
         start_mm, end_mm, half_mm + 0.5 * THING_CELL_MM,
-        low_mm=low, cell_mm=THING_CELL_MM, shape=(ny, nx),
+        low_mm=low, cell_mm=THING_CELL_MM, shape=shape,
     )  # fmt: skip
     groups, _ = ndimage.label(covered, structure=np.ones((3, 3)))
     x, y = np.floor((0.5 * (start_mm + end_mm) - low) / THING_CELL_MM).astype(np.int64).T

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from gcode.reader import Beads
-from gcode.surfaces.lines import near_lines
+from gcode.surfaces.lines import columns_around, near_lines
 
 OUTLINE_CELL_MM = 0.15
 OUTLINE_LAYERS = 40  # evenly spread: enough walls to register by
@@ -61,14 +61,12 @@ def _at_the_edge(
     half_mm: float,
 ) -> Bool[np.ndarray, " n"]:
     cell = OUTLINE_CELL_MM
-    low = np.minimum(start_mm, end_mm).min(axis=0) - 2.0
-    high = np.maximum(start_mm, end_mm).max(axis=0) + 2.0
-    nx, ny = (int(v) for v in np.ceil((high - low) / cell))
+    low, shape = columns_around(start_mm, end_mm, 2.0, cell)
 
     def covered(pick: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "ny nx"]:
         return near_lines(
             start_mm[pick], end_mm[pick], half_mm + 0.5 * cell,
-            low_mm=low, cell_mm=cell, shape=(ny, nx),
+            low_mm=low, cell_mm=cell, shape=shape,
         )  # fmt: skip
 
     voids, count = ndimage.label(~covered(np.ones(len(closed), bool)))

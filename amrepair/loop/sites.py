@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool
 
-from amrepair.frames import Transform, box_of
+from amrepair.frames import Transform
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
 from amrepair.regions import detect
@@ -24,7 +24,7 @@ from gcode.reader import Job
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.surfaces import HeightField
-from gcode.surfaces.lines import heights_by_lines
+from gcode.surfaces.lines import columns_around, heights_by_lines
 
 # Around what the job lays beside the part: strands spread, and stringy ones stray.
 STRINGS_MM, BESIDE_CELL_MM = 0.4, 0.25
@@ -146,12 +146,10 @@ def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> Heig
     beads = job.beads
     start, end = beads.start_mm[pick], beads.end_mm[pick]
     within = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6) + wider_mm
-    low, high = box_of(np.concatenate([start, end])[:, :2])
-    low = low - float(within.max())
-    nx, ny = (int(v) for v in np.ceil((high + float(within.max()) - low) / BESIDE_CELL_MM))
+    low, shape = columns_around(start, end, float(within.max()), BESIDE_CELL_MM)
     z_mm = heights_by_lines(
         start, end, within, np.maximum(start[:, 2], end[:, 2]),
-        low_mm=low, cell_mm=BESIDE_CELL_MM, shape=(ny, nx),
+        low_mm=low, cell_mm=BESIDE_CELL_MM, shape=shape,
     )  # fmt: skip
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
 

@@ -30,7 +30,7 @@ from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.slicing.reach import Reach
 from gcode.surfaces import HeightField
-from gcode.surfaces.lines import heights_by_lines
+from gcode.surfaces.lines import columns_around, heights_by_lines
 
 CENTRED = 12
 """Steps towards the middle of a cell: to a twelfth of its radius."""
@@ -147,11 +147,9 @@ def flats_of(
     start, end = beads.start_mm[pick], beads.end_mm[pick]
     half_mm = 0.5 * beads.width_mm[pick]
     rim_mm = float(half_mm.max()) + options.around_mm
-    low = np.minimum(start, end).min(axis=0)[:2] - rim_mm
-    high = np.maximum(start, end).max(axis=0)[:2] + rim_mm
-    nx, ny = (int(v) for v in np.ceil((high - low) / options.cell_mm))
+    low, shape = columns_around(start, end, rim_mm, options.cell_mm)
     top_mm = heights_by_lines(
-        start, end, half_mm, end[:, 2], low_mm=low, cell_mm=options.cell_mm, shape=(ny, nx)
+        start, end, half_mm, end[:, 2], low_mm=low, cell_mm=options.cell_mm, shape=shape
     )
     laid = np.isfinite(top_mm)
     tip = _disc(probe.tip_radius_mm, options.cell_mm)

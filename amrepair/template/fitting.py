@@ -75,10 +75,7 @@ def fit_template(
                 f"a template is fitted to one mesh, {len(source)} inputs were given"
             )
         source = source[0]
-    progress("read mesh", 0.0, 1.0)
-    mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
-    closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
-    progress("read mesh", 1.0, 1.0)
+    closed = _closed(source, progress)
     metadata = made_from(closed, recipe, seed)
     exact = MeshSdf.from_mesh(closed)
     if recipe == "paper":
@@ -86,6 +83,14 @@ def fit_template(
             exact, options=paper, device=device, seed=seed, metadata=metadata, progress=progress
         )
     return fit_fast(exact, seed=seed, metadata=metadata, options=fast, progress=progress)
+
+
+def _closed(source: Path | str | trimesh.Trimesh, progress: Progress) -> trimesh.Trimesh:
+    progress("read mesh", 0.0, 1.0)
+    mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
+    closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
+    progress("read mesh", 1.0, 1.0)
+    return closed
 
 
 def made_from(closed: trimesh.Trimesh, recipe: str, seed: int) -> dict[str, str]:
@@ -133,10 +138,7 @@ def load_or_fit(
     cache_dir
         Default: `$XDG_CACHE_HOME/amrepair/templates`, or `~/.cache/amrepair/templates`.
     """
-    progress("read mesh", 0.0, 1.0)
-    mesh = load_mesh(source) if isinstance(source, (str, Path)) else source
-    closed = require_mesh(mesh, source=str(mesh.metadata.get("source", "mesh")))
-    progress("read mesh", 1.0, 1.0)
+    closed = _closed(source, progress)
     folder = cache_dir or default_cache_dir()
     versions = [FIT_VERSION, FORMAT_VERSION, amrepair.__version__]
     key = json.dumps([mesh_sha256(closed), "fast", seed, *versions])

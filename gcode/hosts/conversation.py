@@ -216,14 +216,7 @@ class SerialConversation:
         self._greet(self._link.last_sent)
 
     def _learn(self) -> None:
-        caps: dict[str, bool] = {}
-        firmware = ""
-        for event in self._ask("M115"):
-            if isinstance(event, ev.FirmwareInfo):
-                firmware = event.name
-            elif isinstance(event, ev.Capability):
-                caps[event.name] = event.enabled
-        self._capabilities = Capabilities(firmware, caps)
+        self._capabilities = Capabilities.told(self._ask("M115"))
 
     def _log_wire(self, direction: bytes, data: bytes) -> None:
         if self._log is not None:

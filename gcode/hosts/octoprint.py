@@ -86,13 +86,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     def capabilities(self) -> Capabilities:
         """Return what the firmware says of itself (M115), asked for once."""
         if self._capabilities is None:
-            firmware, caps = "", {}
-            for reply in self._session.ask("M115"):
-                if isinstance(reply, ev.FirmwareInfo):
-                    firmware = reply.name
-                elif isinstance(reply, ev.Capability):
-                    caps[reply.name] = reply.enabled
-            self._capabilities = Capabilities(firmware, caps)
+            self._capabilities = Capabilities.told(self._session.ask("M115"))
         return self._capabilities
 
     def temperatures(self) -> Temperatures:

@@ -6,7 +6,7 @@ checked programs only; it does not judge, make or alter them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -16,6 +16,7 @@ from jaxtyping import Int
 from gcode.errors import LinkError, PrinterError
 from gcode.moves import Program
 from gcode.progress import Progress, silent
+from gcode.protocol.events import Capability, FirmwareInfo
 
 
 @runtime_checkable
@@ -48,6 +49,17 @@ class Capabilities:
 
     firmware: str
     caps: dict[str, bool] = field(default_factory=dict)
+
+    @classmethod
+    def told(cls, answers: Iterable[object]) -> Capabilities:
+        """From the answers to M115."""
+        firmware, caps = "", {}
+        for answer in answers:
+            if isinstance(answer, FirmwareInfo):
+                firmware = answer.name
+            elif isinstance(answer, Capability):
+                caps[answer.name] = answer.enabled
+        return cls(firmware, caps)
 
     def has(self, name: str) -> bool:
         """Whether the firmware says that it can do `name`."""

@@ -9,6 +9,19 @@ from gcode.compiled import read_only
 from gcode.surfaces import raster_kernels as kernels
 
 
+def columns_around(
+    start_mm: Float[np.ndarray, "n _a"],
+    end_mm: Float[np.ndarray, "n _a"],
+    margin_mm: float,
+    cell_mm: float,
+) -> tuple[Float[np.ndarray, " 2"], tuple[int, int]]:
+    """(2,) corner and (ny, nx) of the columns that hold lines and a margin around them."""
+    ends = np.concatenate([start_mm[:, :2], end_mm[:, :2]])
+    low, high = ends.min(axis=0) - margin_mm, ends.max(axis=0) + margin_mm
+    nx, ny = np.ceil((high - low) / cell_mm).astype(int).tolist()
+    return low, (ny, nx)
+
+
 def near_lines(
     start_mm: Float[np.ndarray, "n _a"],
     end_mm: Float[np.ndarray, "n _a"],

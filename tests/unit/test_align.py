@@ -12,6 +12,7 @@ from jaxtyping import Float
 from amrepair.align import align
 from amrepair.align import refine_kernels as kernels
 from amrepair.align.coarse import cube_rotations
+from amrepair.align.sizes import refuse_wrong_scale
 from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans import Scan
@@ -129,6 +130,16 @@ def test_another_unit_is_told(template: MeshSdf, factor: float, hint: str) -> No
     points = cloud(template, sigma_mm=0.0, seed=0) * factor
     with pytest.raises(AlignmentError, match=hint):
         align(Scan(points, 0.03, "scanner"), template)
+
+
+@pytest.mark.parametrize(("factor", "hint"), [(1e-3, "--scan-unit m"), (1e3, "convert one")])
+def test_another_unit_is_told_of_a_scan_that_lies_in_place(
+    template: MeshSdf, factor: float, hint: str
+) -> None:
+    points = cloud(template, sigma_mm=0.0, seed=0)
+    refuse_wrong_scale(Scan(points, 0.03, "template"), template)
+    with pytest.raises(InputError, match=hint):
+        refuse_wrong_scale(Scan(points * factor, 0.03, "template"), template)
 
 
 def test_few_points_and_unknown_methods_are_refused(template: MeshSdf) -> None:
