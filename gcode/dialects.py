@@ -31,6 +31,10 @@ class Dialect:
         G91 makes E relative while it lasts, whatever M82 says.
     reads
         Other dialects whose jobs it understands.
+    mesh_again
+        Command for a mesh of the bed that homing switches off; empty where it stays on.
+    wait_to_cool
+        Lines that wait until the hotend, which is off, is as cold as `{c}`, °C.
     """
 
     name: str
@@ -38,16 +42,31 @@ class Dialect:
     g90_sets_e: bool = False
     g91_moves_e: bool = False
     reads: frozenset[str] = frozenset()
+    mesh_again: str = ""
+    wait_to_cool: tuple[str, ...] = ("M109 R{c}", "M104 S0")
 
 
 DIALECTS: dict[str, Dialect] = {
-    # Marlin M204 P: printing acceleration (marlinfw.org/docs/gcode/M204.html)
-    "marlin": Dialect("marlin", "M204 P{a}", g90_sets_e=True, reads=frozenset({"prusa"})),
+    # Marlin M204 P: printing acceleration (marlinfw.org/docs/gcode/M204.html); its G28 switches the
+    # mesh off (G28.md).
+    "marlin": Dialect(
+        "marlin",
+        "M204 P{a}",
+        g90_sets_e=True,
+        reads=frozenset({"prusa"}),
+        mesh_again="M420 S1",
+    ),
     # Prusa-Firmware keeps M204 P from Marlin 1.1; it is a Marlin
     "prusa": Dialect("prusa", "M204 P{a}", reads=frozenset({"marlin"})),
     # Klipper knows M204 S alone (klipper3d.org/G-Codes.html); for G91 see its gcode_move.py.
     # Slicers that know no Klipper write Marlin's words for it.
-    "klipper": Dialect("klipper", "M204 S{a}", g91_moves_e=True, reads=frozenset({"marlin"})),
+    "klipper": Dialect(
+        "klipper",
+        "M204 S{a}",
+        g91_moves_e=True,
+        reads=frozenset({"marlin"}),
+        wait_to_cool=("TEMPERATURE_WAIT SENSOR=extruder MAXIMUM={c}",),
+    ),
     "reprap": Dialect("reprap", "M204 P{a}"),
 }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from gcode.dialects import fan_command, number
+from gcode.dialects import dialect_of, fan_command, number
 from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile, PrintSetup
@@ -97,8 +97,8 @@ class Head:
         """Lift above everything, then home X and Y; never Z."""
         self.lines += ["G21", "G90", "M83", "G92 E0"]
         self.lines += [f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}", "G28 X Y"]
-        if settings.levelled and self._printer.dialect == "marlin":
-            self.lines.append("M420 S1")  # Marlin's G28 switches the mesh off (G28.md)
+        if settings.levelled and (mesh_again := dialect_of(self._printer.dialect).mesh_again):
+            self.lines.append(mesh_again)
 
     def heat(self, hotend_c: float, bed_c: float) -> None:
         """Bed first, the nozzle above the bed's edge meanwhile.

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from gcode.check import CheckedProgram, Touch, check
 from gcode.check.touches import TOUCH_COMMANDS
-from gcode.dialects import number
+from gcode.dialects import dialect_of, number
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrinterProfile, PrintSetup, ProbeProfile
@@ -130,15 +130,15 @@ def plan_touch(
     last = job.layers[first.index - 1]
     places_mm, across_mm = _flat(job.beads, last, options)
     field = standing_field(job.beads, first.first_line, printer)
-    # Marlin's G28 switches the mesh off (G28.md), and the job goes on with it
-    meshed = settings_before(job, first.first_line).levelled and printer.dialect == "marlin"
+    levelled = settings_before(job, first.first_line).levelled  # and the job goes on with the mesh
+    mesh_again = dialect_of(printer.dialect).mesh_again if levelled else ""
     high_mm = height_over(field.top_mm, job.state_after(first.first_line), printer)
 
     def made(where: Float[np.ndarray, "k 2"], below_mm: float) -> CheckedProgram:
         touches = tuple(
             Touch(float(x), float(y), last.z_mm, last.z_mm - below_mm) for x, y in where
         )
-        text = _text(touches, setup, high_mm, meshed=meshed)
+        text = _text(touches, setup, high_mm, mesh_again)
         whole = Program(text, program.dialect)
         return check(whole, setup, as_built=field, touches=touches, progress=progress)
 
@@ -176,13 +176,13 @@ def _refuse_impossible(printer: PrinterProfile, above_mm: float, options: TouchO
         )
 
 
-def _text(touches: tuple[Touch, ...], setup: PrintSetup, high_mm: float, *, meshed: bool) -> str:
+def _text(touches: tuple[Touch, ...], setup: PrintSetup, high_mm: float, mesh_again: str) -> str:
     """Above everything, X and Y homed; over each place, down to it, and up again."""
     z_feed = f" F{feed(setup.printer.z_speed_mm_s)}"
     travel = f" F{feed(setup.printer.travel_speed_mm_s)}"
     up = f"G1 Z{number(high_mm, 3)}{z_feed}"
     lines = ["; Z found anew: heaters off, never deeper than planned", "G21", "G90", "M83", up]
-    lines += ["G28 X Y", "M420 S1"] if meshed else ["G28 X Y"]
+    lines += ["G28 X Y", mesh_again] if mesh_again else ["G28 X Y"]
     for touch in touches:
         lines += [
             f"G1 X{number(touch.x_mm, 3)} Y{number(touch.y_mm, 3)}{travel}",

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gcode.check import CheckedProgram, Touch, check
-from gcode.dialects import fan_command, number
+from gcode.dialects import dialect_of, fan_command, number
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.resumption.head import feed
@@ -74,8 +74,7 @@ def cooled(setup: PrintSetup, rest: ModalState) -> CheckedProgram | None:
     if probe.kind != "nozzle" or rest.hotend_c <= 0:
         return None
     cold = number(max(probe.cold_c, rest.bed_c + ABOVE_BED_C), 0)
-    waits = {"klipper": [f"TEMPERATURE_WAIT SENSOR=extruder MAXIMUM={cold}"]}
-    wait = waits.get(setup.printer.dialect, [f"M109 R{cold}", "M104 S0"])
+    wait = [line.format(c=cold) for line in dialect_of(setup.printer.dialect).wait_to_cool]
     lines = ["; cold, to touch", "M104 S0", "M106 S255", *wait, fan_command(rest.fan_ratio)]
     program = Program("\n".join(lines) + "\n", setup.printer.dialect)
     return check(program, setup, initial=rest)
