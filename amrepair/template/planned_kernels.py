@@ -71,7 +71,7 @@ def interpolate(points, origin, voxel, field):
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _envelope(f, n, d, v, z):
     """Squared distances along a line: the lower envelope of parabolas that stand at its places.
 
