@@ -71,7 +71,7 @@ class Sought:
 
     def nearest_is_labelled(self, samples_mm: Points) -> Mask:
         """(k,) whether the test found the surfel nearest to each place."""
-        nearest = self.evidence.surfels.tree.query(samples_mm, workers=2)[1]
+        nearest = self.evidence.surfels.tree.nearest_one(samples_mm)
         return np.asarray(self.labelled[nearest])
 
     def allowed_mm(self, samples_mm: Points, asked: Mask) -> Values:
@@ -79,7 +79,7 @@ class Sought:
         allowed_mm = np.zeros(len(samples_mm))
         higher_mm = self.anomaly.surfel_higher_mm
         if self.is_excess and higher_mm is not None and (higher_mm > 0).any():
-            nearest = self.evidence.surfels.tree.query(samples_mm[asked], workers=2)[1]
+            nearest = self.evidence.surfels.tree.nearest_one(samples_mm[asked])
             allowed_mm[asked] = higher_mm[nearest]
         return allowed_mm
 

@@ -145,7 +145,7 @@ def gather(
         faces = find_faces(
             scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=options
         )
-        nearest = faces.planes.tree.query(surfels.place_mm[which], workers=2)[1]
+        nearest = faces.planes.tree.nearest_one(surfels.place_mm[which])
         normal[which] = _toward(surfels.planes(which), faces.planes.normal[nearest])
     return Evidence(surfels, off, normal, images, options, faces)
 

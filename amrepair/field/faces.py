@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import faces_kernels as kernels
@@ -19,6 +18,7 @@ from amrepair.field.fused import Surfels
 from amrepair.field.near import has_near
 from amrepair.field.occupancy import Broken, Occupancy, find_occupancy
 from amrepair.field.options import EvidenceOptions, FaceOptions
+from amrepair.field.places import PlaceTree
 from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -65,19 +65,23 @@ class SurfacePlanes:
     deviation_mm: Values
     off: Mask
     normal: Points
-    tree: cKDTree
+    tree: PlaceTree
 
     def nearest(
-        self, points_mm: Float[np.ndarray, "m 3"], f_mm: Values, count: int, blur_mm: float
+        self,
+        points_mm: Float[np.ndarray, "m 3"],
+        f_mm: Values,
+        count: int,
+        blur_mm: float,
+        within_mm: float = np.inf,
     ) -> NearestPlanes:
         """Ask as many nearest places on which side of the surface points lie.
 
         A place on the template answers f(x) − f(place): exact on curves and edges. One off it
-        answers with its own plane. `blur_mm` says how fast farther ones count less.
+        answers with its own plane. `blur_mm` says how fast farther ones count less. Where none lies
+        within a distance only how far the nearest lies is told.
         """
-        k = min(count, len(self.place_mm))
-        distance, index = self.tree.query(points_mm, k=k, workers=2)
-        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+        distance, index = self.tree.nearest(points_mm, count, within_mm)
         value, height = kernels.plane_values(
             np.ascontiguousarray(points_mm), f_mm, distance, index,
             self.place_mm, self.deviation_mm, self.off, self.normal, blur_mm,
@@ -114,10 +118,11 @@ class Faces:
         the nearest place how far; beyond its box it is as designed.
         """
         options, s = self.options, self.spacing_mm
-        near = self.planes.nearest(points_mm, f_mm, options.neighbours, 2 * s)
+        near_mm = options.near_spacings * s
+        near = self.planes.nearest(points_mm, f_mm, options.neighbours, 2 * s, near_mm)
         best, distance = near.value_mm, near.distance_mm
         beside_mm = options.beside_spacings * s + options.beside_per_height * near.height_mm
-        far = (distance > options.near_spacings * s) | (near.sideways_mm > beside_mm)
+        far = (distance > near_mm) | (near.sideways_mm > beside_mm)
         ask = np.flatnonzero(far | (distance > self.occupancy.voxel_mm))
         told = self.occupancy.at(points_mm[ask])
         designed = -np.sign(f_mm[ask])
@@ -157,13 +162,11 @@ class _Places:
         spacing_mm: float, options: FaceOptions,
     ) -> _Places:  # fmt: skip
         """Points moved onto the planes through their neighbours, and which are broken."""
-        k = min(options.plane_points, len(points_mm))
-        distance, index = cKDTree(points_mm).query(points_mm, k=k, workers=2)
-        distance, index = distance.reshape(-1, k), index.reshape(-1, k)
+        distance, index = PlaceTree.of(points_mm).neighbours(options.plane_points)
         place, plane = kernels.smoothed(
             points_mm, index, options.plane_rounds, spacing_mm, 2 * sigma_mm
         )
-        area_mm2 = np.pi * distance[:, -1] ** 2 / max(k - 1, 1)
+        area_mm2 = np.pi * distance[:, -1] ** 2 / max(index.shape[1] - 1, 1)
         deviation, gradient = template.distance_and_gradient(place)
         outward = unit_vectors(gradient)
         along = np.abs((outward * plane).sum(axis=1))
@@ -283,6 +286,6 @@ def find_faces(
         np.concatenate([at.deviation_mm, surfels.deviation_mm[rest]]),
         np.append(at.is_broken, np.zeros(int(rest.sum()), bool)),
         np.concatenate([normal, np.zeros((int(rest.sum()), 3))]),
-        cKDTree(places, compact_nodes=False, balanced_tree=False),
+        PlaceTree.of(places),
     )
     return Faces(planes, spacing_mm, occupancy, options.faces)

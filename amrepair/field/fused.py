@@ -11,11 +11,11 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import fused_kernels as kernels
 from amrepair.field.options import USUAL_SURFELS, SurfelOptions
+from amrepair.field.places import PlaceTree
 from amrepair.frames import box_of, cells_of
 from amrepair.observe.views import Shares
 from amrepair.scans import Scan
@@ -73,9 +73,9 @@ class Surfels:
         return len(self.place_mm)
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> PlaceTree:
         """Of the places; made when first asked for, as at a clean layer few are."""
-        return cKDTree(self.place_mm, compact_nodes=False, balanced_tree=False)
+        return PlaceTree.of(self.place_mm)
 
     def planes(self, which: Numbers) -> Points:
         """(q, 3) unit normals (either sign) of the planes through each cell and its neighbours."""

@@ -14,10 +14,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from amrepair.arrays import Mask, Numbers, Points, Values, VoxelMask, Voxels
+from amrepair.field import cut_kernels as kernels
 from amrepair.field.groups import group_points
 from amrepair.field.near import has_near, nearest_within
 from amrepair.field.options import OccupancyOptions
@@ -189,7 +188,8 @@ def find_occupancy(
     facets = _facets(grid)
     nats = unseen[facets.axis] * _unexplained(scan, facets, grid.voxel_mm)[:, None]
     told = _told(scan, grid)
-    empty = _with_open_sides(_labelled(facets, nats, told), scan, facets, nats, told, grid)
+    cut = _Cut.of(facets, nats, len(told))
+    empty = _with_open_sides(cut.labelled(told), scan, cut, told, grid)
     solid = np.zeros(grid.number.shape, bool)
     solid[grid.number >= 0] = ~empty
     return Occupancy(grid.low_mm, grid.voxel_mm, _as_seen(solid, scan, grid), grid.f_mm < 0)
@@ -358,30 +358,59 @@ def _told(scan: _Scanned, grid: _Grid) -> Float[np.ndarray, " v"]:
     return told
 
 
-def _labelled(facets: _Facets, nats: Float[np.ndarray, "k 2"], told: Values) -> Mask:
-    """(v,) whether each voxel is empty in the cheapest labelling: a minimum cut.
+@dataclass(frozen=True, slots=True)
+class _Cut:
+    """What it costs where one voxel of two that meet is empty, nats; and labellings by that.
 
-    Of equally cheap ones that with the most solid: empty is what still reaches what is empty for
-    certain once no more flow fits (Ford & Fulkerson 1956).
+    Attributes
+    ----------
+    facets, nats
+        Where they meet, (k, 2) of each the price of `one` solid alone, and of `other` alone.
+    beyond
+        (2, v) of a voxel that is solid where nothing is beyond it, on the one side and the other.
+    beside, fits
+        (v, 6) voxels before and behind on each axis, −1 where there is none; prices, `UNIT_NATS`.
     """
-    count = len(told)
-    for mine, none, k in ((facets.one, facets.other, 0), (facets.other, facets.one, 1)):
-        edge = (mine >= 0) & (none < 0)  # what lies beyond is empty: solid ends here
-        told = told - np.bincount(mine[edge], nats[edge, k], minlength=count)
-    both = (facets.one >= 0) & (facets.other >= 0)
-    one, other, every = facets.one[both], facets.other[both], np.arange(count)
-    solid, empty = np.full(count, count), np.full(count, count + 1)
-    rows = np.concatenate([one, other, solid, every])
-    columns = np.concatenate([other, one, every, empty])
-    costs = np.concatenate([*nats[both].T, np.maximum(told, 0.0), np.maximum(-told, 0.0)])
-    fits = np.round(np.minimum(costs, MOST_NATS) / UNIT_NATS).astype(np.int32)
-    graph = coo_array((fits, (rows, columns)), shape=(count + 2, count + 2)).tocsr()
-    left = graph - maximum_flow(graph, count, count + 1).flow
-    left.eliminate_zeros()
-    reaching = breadth_first_order(left.T.tocsr(), count + 1, return_predecessors=False)
-    is_empty = np.zeros(count + 2, bool)
-    is_empty[reaching] = True
-    return is_empty[:count]
+
+    facets: _Facets
+    nats: Float[np.ndarray, "k 2"]
+    beyond: Float[np.ndarray, "2 v"]
+    beside: Int[np.ndarray, "v 6"]
+    fits: Int[np.ndarray, "v 6"]
+
+    @classmethod
+    def of(cls, facets: _Facets, nats: Float[np.ndarray, "k 2"], count: int) -> _Cut:
+        """Of so many voxels."""
+        beyond = np.zeros((2, count))
+        for mine, none, k in ((facets.one, facets.other, 0), (facets.other, facets.one, 1)):
+            edge = (mine >= 0) & (none < 0)  # what lies beyond is empty: solid ends here
+            beyond[k] = np.bincount(mine[edge], nats[edge, k], minlength=count)
+        whole = facets.one, facets.other, facets.axis, _in_units(nats), count
+        return cls(facets, nats, beyond, *kernels.joined(*whole))
+
+    def labelled(self, told: Values) -> Mask:
+        """(v,) whether each voxel is empty in the cheapest labelling: a minimum cut.
+
+        Of equally cheap ones that with the most solid: empty is what still reaches what is empty
+        for certain once no more flow fits (Ford & Fulkerson 1956).
+        """
+        for nats in self.beyond:
+            told = told - nats
+        return np.asarray(
+            kernels.flow(self.beside, self.fits.copy(), _in_units(told)) == kernels.EMPTY
+        )
+
+    def cost(self, empty: Mask, told: Values) -> float:
+        """Of a labelling, nats."""
+        solid = np.append(~empty, False)
+        one, other = solid[self.facets.one], solid[self.facets.other]
+        surface = self.nats[one & ~other, 0].sum() + self.nats[other & ~one, 1].sum()
+        return float(told[empty].sum() + surface)
+
+
+def _in_units(nats: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
+    """Whole numbers of `UNIT_NATS`."""
+    return np.round(np.clip(nats, -MOST_NATS, MOST_NATS) / UNIT_NATS).astype(np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -447,14 +476,7 @@ class _Sides:
             yield np.where(room == k, -MOST_NATS, told)
 
 
-def _with_open_sides(
-    empty: Mask,
-    scan: _Scanned,
-    facets: _Facets,
-    nats: Float[np.ndarray, "k 2"],
-    told: Values,
-    grid: _Grid,
-) -> Mask:
+def _with_open_sides(empty: Mask, scan: _Scanned, cut: _Cut, told: Values, grid: _Grid) -> Mask:
     """The same, or a cheaper labelling in which broken surface has an open side.
 
     As much of it as is around a bead must have none, or it stays.
@@ -463,10 +485,7 @@ def _with_open_sides(
     least = np.pi * (scan.options.bead_mm / scan.spacing_mm) ** 2
 
     def cost(labels: Mask) -> float:
-        solid = np.append(~labels, False)
-        one, other = solid[facets.one], solid[facets.other]
-        surface = nats[one & ~other, 0].sum() + nats[other & ~one, 1].sum()
-        return float(told[labels].sum() + surface + sides.price * sides.is_shut(labels).sum())
+        return cut.cost(labels, told) + float(sides.price * sides.is_shut(labels).sum())
 
     if sides.is_shut(empty).sum() < least:
         return empty
@@ -482,7 +501,7 @@ def _with_open_sides(
     room = ndimage.label(uncut)[0][within]
     best, least_cost = empty, cost(empty)
     for proposed in sides.proposed(empty, room, told, least):
-        tried = _labelled(facets, nats, proposed)
+        tried = cut.labelled(proposed)
         if (price := cost(tried)) < least_cost:
             best, least_cost = tried, price
     return best

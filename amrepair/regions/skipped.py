@@ -334,9 +334,8 @@ def _topped(
 ) -> Mask:
     """Looks at which something was seen at the line's own top: there it is, however rounded."""
     top_mm = middle_mm + half_mm[:, None] * np.array([0.0, 0.0, 1.0])
-    distance, near = evidence.surfels.tree.query(top_mm, k=options.about)
-    height_mm = np.append(evidence.surfels.place_mm[:, 2], np.inf)[near]  # inf: no such neighbour
-    low_mm = np.abs(top_mm[:, 2:] - height_mm)
+    distance, near = evidence.surfels.tree.nearest(top_mm, options.about)
+    low_mm = np.abs(top_mm[:, 2:] - evidence.surfels.place_mm[near, 2])
     at_top = (distance < 0.5 * width_mm[:, None]) & (low_mm < options.top_share * half_mm[:, None])
     return np.asarray(at_top.any(axis=1))
 

@@ -11,6 +11,7 @@ from amrepair.deficit.heights import _tops
 from amrepair.deficit.options import HeightOptions
 from amrepair.field import faces_kernels
 from amrepair.field.fused import make_surfels
+from amrepair.field.places import PlaceTree
 from amrepair.regions.strands import on_strands
 from amrepair.scans import Scan
 from gcode.surfaces import HeightField
@@ -51,6 +52,30 @@ def test_points_are_moved_onto_the_planes_through_their_neighbours(
     alike = np.abs((normal * true_normal).sum(axis=1)) > 1.0 - 1e-6
     assert alike.mean() > 0.99
     np.testing.assert_allclose(place[alike], true_place[alike], atol=1e-4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=SEEDS, count=st.integers(1, 7), places=st.integers(1, 400))
+def test_the_nearest_places_are_those_of_scipys_tree(seed: int, count: int, places: int) -> None:
+    rng = np.random.default_rng(seed)
+    shell = rng.normal(size=(places, 3))
+    shell *= 5.0 / np.linalg.norm(shell, axis=1, keepdims=True)
+    shell[: places // 4] = np.round(shell[: places // 4])  # some in one place
+    asked = np.concatenate([rng.uniform(-8.0, 8.0, (700, 3)), shell + 0.01])
+    tree, k = PlaceTree.of(shell), min(count, places)
+    first = [*range(1, k + 1)]
+    distance = cKDTree(shell).query(asked, k=first)[0]
+    found, number = tree.nearest(asked, count)
+    np.testing.assert_array_equal(found, distance)
+    assert all(len(set(row)) == k for row in number.tolist())
+    np.testing.assert_allclose(np.linalg.norm(shell[number] - asked[:, None], axis=2), found)
+    near = distance[:, 0] <= 3.0
+    bounded = tree.nearest(asked, count, 3.0)[0]
+    np.testing.assert_array_equal(bounded[near], distance[near])
+    np.testing.assert_array_equal(bounded[:, 0], distance[:, 0])
+    np.testing.assert_array_equal(
+        tree.neighbours(count)[0], cKDTree(shell).query(shell, k=first)[0]
+    )
 
 
 @settings(max_examples=20, deadline=None)

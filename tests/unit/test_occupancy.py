@@ -11,9 +11,11 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from amrepair.deficit import compute_deficit
-from amrepair.field.occupancy import Broken, _facets, _Grid, _labelled, find_occupancy
+from amrepair.field.occupancy import UNIT_NATS, Broken, _Cut, _facets, _Grid, find_occupancy
 from amrepair.field.options import OccupancyOptions
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -46,7 +48,34 @@ def test_the_labelling_is_the_cheapest_of_all_and_of_those_has_the_most_solid(
 
     every = list(itertools.product([False, True], repeat=count))
     best = min(every, key=lambda empty: (cost(empty), sum(empty)))
-    assert _labelled(facets, nats, told).tolist() == list(best)
+    assert _Cut.of(facets, nats, count).labelled(told).tolist() == list(best)
+
+
+@settings(max_examples=30, deadline=None)
+@given(shape=st.tuples(*[st.integers(2, 12)] * 3), seed=st.integers(0, 2**32 - 1))
+def test_what_is_empty_is_what_scipys_largest_flow_leaves_reaching_empty(
+    shape: tuple[int, int, int], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    number = np.arange(int(np.prod(shape))).reshape(shape)
+    facets = _facets(_Grid(np.zeros(3), 1.0, np.full(shape, -1.0), number))
+    count, some = number.size, len(facets.one)
+    nats = UNIT_NATS * np.where(rng.random((some, 2)) < 0.3, 0, rng.integers(0, 60, (some, 2)))
+    # most is solid, a little; here and there something is empty for certain
+    told = UNIT_NATS * np.where(
+        rng.random(count) < 0.1, rng.integers(-400, 0, count), rng.integers(0, 30, count)
+    )
+    every = np.arange(count)
+    rows = np.concatenate([facets.one, facets.other, np.full(count, count), every])
+    columns = np.concatenate([facets.other, facets.one, every, np.full(count, count + 1)])
+    prices = np.concatenate([*nats.T, np.maximum(told, 0.0), np.maximum(-told, 0.0)])
+    fits = np.round(prices / UNIT_NATS).astype(np.int32)
+    graph = coo_array((fits, (rows, columns)), shape=(count + 2, count + 2)).tocsr()
+    left = graph - maximum_flow(graph, count, count + 1).flow
+    left.eliminate_zeros()
+    reaching = breadth_first_order(left.T.tocsr(), count + 1, return_predecessors=False)
+    empty = np.isin(every, reaching)
+    np.testing.assert_array_equal(_Cut.of(facets, nats, count).labelled(told), empty)
 
 
 @pytest.mark.parametrize("turned", [False, True])
