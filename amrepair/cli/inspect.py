@@ -214,6 +214,7 @@ def detect(
 
         from amrepair.align import align as align_scan
         from amrepair.deficit import compute_deficit, measured_regions
+        from amrepair.deficit.options import USUAL_DEFICIT
         from amrepair.frames import Transform
         from amrepair.regions import detect as detect_defects
         from amrepair.repair import Stopwatch
@@ -244,8 +245,9 @@ def detect(
         _refuse_too_noisy(anomaly, smallest_mm, scan)
         with watch("measure"):
             in_place = Transform.identity("build", "template")
+            solids = replace(USUAL_DEFICIT, early_mm3=np.inf)  # nobody asks what stands there
             deficit = compute_deficit(
-                placed, field, anomaly, build_from_template=in_place, progress=bars
+                placed, field, anomaly, build_from_template=in_place, options=solids, progress=bars
             )
             regions = measured_regions(anomaly, deficit)
         with bars.stage("write"):

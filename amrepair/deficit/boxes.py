@@ -174,7 +174,7 @@ def _paths_out(sought: Sought, which: Numbers) -> Float[np.ndarray, "p 3"]:
     for _ in range(int(reach_mm / step_mm) + 1):
         front = front + step_mm * along
         f = sought.template.distance(front)
-        go_on = (f < 0) & (sought.evidence.clearance(front, f)[0] > 0)
+        go_on = (f < 0) & (sought.evidence.clearance(front, f, 0.0)[0] > 0)
         if not go_on.any():
             break
         front, along = front[go_on], along[go_on]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from amrepair.arrays import Mask, Points, Values, VoxelMask
+from amrepair.arrays import Mask, Points, Values, VoxelMask, Voxels
 from amrepair.deficit.boxes import Box, Sought, boxes_of
 from amrepair.deficit.voxels import VoxelBox, solid_from_field
 from amrepair.field.as_built import SOLID_MM
@@ -57,7 +57,9 @@ def _solid_in_box(sought: Sought, place: Box) -> manifold3d.Manifold:
         can_be &= samples[:, 2] > float(template.bounds_mm[0, 2])  # nothing stands in the bed
     near = np.flatnonzero(can_be)
     best, cautious = (np.full(len(f), -FAR_MM) for _ in range(2))  # how surely it is so
-    best[near], cautious[near] = _shown(sought, samples[near], f[near])
+    # farther off no sample shapes a surface, nor is it thinner than what is eroded
+    most_mm = max(box.surface_mm, 2 * sought.tau_mm)
+    best[near], cautious[near] = _shown(sought, samples[near], f[near], most_mm)
     # both have to be: inside the template and outside the as-built part, or the reverse
     clip = -np.minimum(deep_mm, best)
     limit_mm, thin_mm = _limits(sought, samples, f, depth_mm)
@@ -81,11 +83,16 @@ def _solid_in_box(sought: Sought, place: Box) -> manifold3d.Manifold:
     return _grown_back(sought, box, core, clip, f)
 
 
-def _shown(sought: Sought, samples_mm: Points, f_mm: Values) -> tuple[Values, Values]:
-    """(k,) how far samples lie in what is sought, empty or solid, best known and cautiously."""
+def _shown(
+    sought: Sought, samples_mm: Points, f_mm: Values, most_mm: float
+) -> tuple[Values, Values]:
+    """(k,) how far samples lie in what is sought, empty or solid, best known and cautiously.
+
+    Exact up to `most_mm`.
+    """
     evidence = sought.evidence
     if not sought.is_excess:
-        best, cautious = evidence.clearance(samples_mm, f_mm)
+        best, cautious = evidence.clearance(samples_mm, f_mm, most_mm)
         best, held = best.copy(), np.flatnonzero(best < 0)
         held = held[sought.in_lines_that_hung(samples_mm[held])]
         best[held] = np.maximum(best[held], evidence.rays_say(samples_mm[held]))
@@ -129,7 +136,19 @@ def _grown_back(
     if not sought.is_excess:
         wanted = f_mm.reshape(box.shape) < 0
         field = np.where(_hangs_free(wanted, shaped < 0, field < 0), shaped, field)
-    return solid_from_field(box, field)
+    return solid_from_field(box, _without_crumbs(box, field, sought.options.voxels.crumb_mm3))
+
+
+def _without_crumbs(box: VoxelBox, field_mm: Voxels, least_mm3: float) -> Voxels:
+    """The same without samples that make pieces too small to count, most of them of one alone.
+
+    Marching cubes leaves each corner of a cube at most a third of it, and a sample has eight cubes.
+    """
+    groups, _ = ndimage.label(field_mm < 0, structure=np.ones((3, 3, 3), bool))
+    most_mm3 = 8 / 3 * float(np.prod(box.step_mm)) * np.bincount(groups.ravel())
+    crumb = most_mm3 < least_mm3
+    crumb[0] = False
+    return np.where(crumb[groups], FAR_MM, field_mm)
 
 
 def _of_a_region(

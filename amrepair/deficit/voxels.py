@@ -16,6 +16,8 @@ from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
 from gcode.solids import as_manifold, is_valid
 
+SURFACE_STEPS = 4.0  # of a grid: more than the longest way between corners of a cube
+
 
 @dataclass(frozen=True, slots=True)
 class VoxelBox:
@@ -68,6 +70,11 @@ class VoxelBox:
         size = np.ceil(extent / step).astype(int) + 1
         return cls(low_mm, step, (int(size[0]), int(size[1]), int(size[2])))
 
+    @property
+    def surface_mm(self) -> float:
+        """What is farther than this from a surface has no part in its shape."""
+        return SURFACE_STEPS * float(self.step_mm.max())
+
     def samples_mm(self) -> Points:
         """(v, 3) all sample points, last axis fastest."""
         axes = [self.low_mm[i] + self.step_mm[i] * np.arange(self.shape[i]) for i in range(3)]
@@ -92,7 +99,7 @@ def solid_from_field(box: VoxelBox, field_mm: Voxels) -> manifold3d.Manifold:
     field_mm = np.where(np.abs(field_mm) < 1e-6, 1e-6, field_mm)
     if not (field_mm < 0).any():
         return manifold3d.Manifold()
-    limit = float(box.step_mm.max()) * 4
+    limit = box.surface_mm
     padded = np.pad(np.clip(field_mm, -limit, limit), 1, constant_values=limit)
     extract: Any = measure.marching_cubes
     for method in ("lewiner", "lorensen"):

@@ -62,31 +62,34 @@ class Evidence:
         """Whether sensors are known."""
         return bool(self.images)
 
-    def clearance(self, points_mm: Points, f_mm: Values) -> tuple[Values, Values]:
+    def clearance(
+        self, points_mm: Points, f_mm: Values, most_mm: float = np.inf
+    ) -> tuple[Values, Values]:
         """How far each point lies outside the as-built part: best estimate, and a cautious one.
 
-        Positive is empty. `f_mm` is the template's distance at the points.
+        Positive is empty. `f_mm` is the template's distance at the points; how much farther than
+        `most_mm` it is need not be told.
         """
         if not self.has_rays:
-            near = self._by_surface(points_mm, f_mm)
+            near = self._by_surface(points_mm, f_mm, most_mm)
             return near, near
         best, least = clearances(self.images, points_mm, SOLID_MM)
         return self._sharpened(points_mm, f_mm, best), least
 
-    def cautious(self, points_mm: Points, f_mm: Values) -> Values:
+    def cautious(self, points_mm: Points, f_mm: Values, most_mm: float = np.inf) -> Values:
         """The cautious half of `clearance`, which costs the less."""
         if not self.has_rays:
-            return self._by_surface(points_mm, f_mm)
+            return self._by_surface(points_mm, f_mm, most_mm)
         return clearances(self.images, points_mm, SOLID_MM)[1]
 
     def rays_say(self, points_mm: Points) -> Values:
         """The best estimate of `clearance` by rays alone; cheap, and noisy by a pixel."""
         return clearances(self.images, points_mm, SOLID_MM)[0]
 
-    def _by_surface(self, points_mm: Points, f_mm: Values) -> Values:
+    def _by_surface(self, points_mm: Points, f_mm: Values, most_mm: float) -> Values:
         """What the scanned surface says where there are no rays."""
         if self.faces is not None:
-            return self.faces.clearance(points_mm, f_mm)
+            return self.faces.clearance(points_mm, f_mm, most_mm)
         return self.surface_clearance(points_mm, f_mm)
 
     def _sharpened(self, points_mm: Points, f_mm: Values, best_mm: Values) -> Values:

@@ -74,14 +74,15 @@ class SurfacePlanes:
         count: int,
         blur_mm: float,
         within_mm: float = np.inf,
+        most_mm: float = np.inf,
     ) -> NearestPlanes:
         """Ask as many nearest places on which side of the surface points lie.
 
         A place on the template answers f(x) − f(place): exact on curves and edges. One off it
         answers with its own plane. `blur_mm` says how fast farther ones count less. Where none lies
-        within a distance only how far the nearest lies is told.
+        within a distance only how far the nearest lies is told, up to `most_mm`.
         """
-        distance, index = self.tree.nearest(points_mm, count, within_mm)
+        distance, index = self.tree.nearest(points_mm, count, within_mm, most_mm)
         value, height = kernels.plane_values(
             np.ascontiguousarray(points_mm), f_mm, distance, index,
             self.place_mm, self.deviation_mm, self.off, self.normal, blur_mm,
@@ -111,15 +112,16 @@ class Faces:
     occupancy: Occupancy
     options: FaceOptions
 
-    def clearance(self, points_mm: Points, f_mm: Values) -> Values:
-        """Signed distance to what stands there, positive outside.
+    def clearance(self, points_mm: Points, f_mm: Values, most_mm: float) -> Values:
+        """Signed distance to what stands there, positive outside; exact up to `most_mm`.
 
         The nearest places answer. Where none lies over the point, the occupancy says the side and
         the nearest place how far; beyond its box it is as designed.
         """
         options, s = self.options, self.spacing_mm
         near_mm = options.near_spacings * s
-        near = self.planes.nearest(points_mm, f_mm, options.neighbours, 2 * s, near_mm)
+        most_mm = max(most_mm, 1.001 * near_mm)  # what is beyond must not be told to lie at it
+        near = self.planes.nearest(points_mm, f_mm, options.neighbours, 2 * s, near_mm, most_mm)
         best, distance = near.value_mm, near.distance_mm
         beside_mm = options.beside_spacings * s + options.beside_per_height * near.height_mm
         far = (distance > near_mm) | (near.sideways_mm > beside_mm)

@@ -37,16 +37,20 @@ class PlaceTree:
         return cls(order, tuple(nodes))
 
     def nearest(
-        self, points_mm: Float[np.ndarray, "m 3"], count: int, within_mm: float = np.inf
+        self,
+        points_mm: Float[np.ndarray, "m 3"],
+        count: int,
+        within_mm: float = np.inf,
+        most_mm: float = np.inf,
     ) -> tuple[Float[np.ndarray, "m k"], Int[np.ndarray, "m k"]]:
         """(m, k) distances of the nearest places and their numbers, the nearest first.
 
         As many as are asked for, or there are. Where the nearest lies farther off than `within_mm`
-        the others are any.
+        the others are any, and where it lies farther off than `most_mm` it is said to lie so far.
         """
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         k = min(count, len(self.order))
-        return kernels.nearest(points, self.order, self.nodes, k, within_mm)
+        return kernels.nearest(points, self.order, self.nodes, k, within_mm, most_mm)
 
     def nearest_one(self, points_mm: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, " m"]:
         """(m,) number of the nearest place."""

@@ -111,10 +111,11 @@ def _closer(x, y, z, near, near2, k, tree, stack, stack2):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def nearest(points, order, tree, count, within):
+def nearest(points, order, tree, count, within, most):
     """(n, k) distances to the nearest places and their numbers, the nearest first.
 
-    Where the nearest is farther off than `within`, the others are just places.
+    Where the nearest is farther off than `within`, the others are just places; and where it is
+    farther off than `most`, it is one, too, and said to be so far.
     """
     n = len(points)
     ordered = tree[0]
@@ -133,6 +134,7 @@ def nearest(points, order, tree, count, within):
                     near[m], near2[m] = near[m - 1], near2[m - 1]
                     m -= 1
                 near[m], near2[m] = p, here2
+            near2[0] = min(near2[0], most * most)
             _closer(x, y, z, near, near2, 1, tree, stack, stack2)
             if count > 1 and near2[0] <= within * within:
                 _closer(x, y, z, near, near2, count, tree, stack, stack2)

@@ -251,7 +251,7 @@ def _label_surface(seen: Observed, evidence: Evidence, test: Tested) -> Numbers:
         # just inside the surface, as deep as the limit: empty there is more than noise
         inside = surface_mm[open_] - limit_mm * seen.normals[open_]
         f_mm = seen.template.distance(inside)
-        empty = (evidence.cautious(inside, f_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
+        empty = (evidence.cautious(inside, f_mm, limit_mm) > limit_mm / 2) & (f_mm < -limit_mm / 2)
         # what nobody saw is missing only as part of what was seen to be
         places_mm = np.concatenate([surfels.place_mm[missing], surface_mm[open_[empty]]])
         group = group_points(places_mm, reach_mm=touching_mm(surfels.cell_mm))

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.template import surface_kernels as kernels
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -22,10 +24,7 @@ def triangle_areas_normals(
     vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f 3"]]:
     """(f,) areas in mm² and (f, 3) unit normals (zero where a triangle has no area)."""
-    corners = vertices_mm[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    norm = np.linalg.norm(cross, axis=1)
-    return 0.5 * norm, cross / np.maximum(norm, 1e-300)[:, None]
+    return kernels.areas_normals(*_for_kernels(vertices_mm, faces))
 
 
 def sample_surface(
@@ -46,20 +45,17 @@ def sample_surface(
     -------
     (m, 3) points in mm, (m, 3) unit normals of their triangles, (m,) triangle indices.
     """
-    areas, normals = triangle_areas_normals(vertices_mm, faces)
-    cumulative = np.cumsum(areas)
-    shift = offset % 1.0
-    targets = (np.arange(count) + shift) * (cumulative[-1] / count)
-    triangle = np.minimum(np.searchsorted(cumulative, targets, side="right"), len(faces) - 1)
-    uv = (shift + np.arange(1, count + 1)[:, None] * _R2) % 1.0
-    root = np.sqrt(uv[:, :1])
-    corners = vertices_mm[faces[triangle]]
-    points = (
-        (1.0 - root) * corners[:, 0]
-        + root * (1.0 - uv[:, 1:]) * corners[:, 1]
-        + root * uv[:, 1:] * corners[:, 2]
-    )
-    return points, normals[triangle], triangle.astype(np.int64)
+    mesh = _for_kernels(vertices_mm, faces)
+    areas, normals = kernels.areas_normals(*mesh)
+    points, triangle = kernels.spread_over(*mesh, np.cumsum(areas), offset % 1.0, _R2, count)
+    return points, normals[triangle], triangle
+
+
+def _for_kernels(
+    vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """The same in one type, so that each kernel is compiled once."""
+    return np.ascontiguousarray(vertices_mm, np.float64), np.ascontiguousarray(faces, np.int64)
 
 
 def count_for_spacing(areas_mm2: Float[np.ndarray, " f"], spacing_mm: float) -> int:
