@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from amrepair.arrays import Mask, Points, Values, VoxelMask, Voxels
+from amrepair.arrays import Mask, Points, Values, VoxelMask
 from amrepair.deficit.boxes import Box, Sought, boxes_of
-from amrepair.deficit.voxels import VoxelBox, solid_from_field
+from amrepair.deficit.voxels import VoxelBox, solids_from_field
 from amrepair.field.as_built import SOLID_MM
 from amrepair.frames import in_box
 from amrepair.observe.background import ON_PLANE_MM
@@ -27,15 +27,11 @@ def pieces_of(sought: Sought, progress: Progress) -> list[manifold3d.Manifold]:
     found: list[manifold3d.Manifold] = []
     for i, box in enumerate(boxes):
         progress(f"deficit: {sought.label.name.lower()}", float(i), float(len(boxes)))
-        found += [
-            piece
-            for piece in _solid_in_box(sought, box).decompose()
-            if piece.volume() >= sought.options.voxels.crumb_mm3
-        ]
+        found += _solids_in_box(sought, box)
     return found
 
 
-def _solid_in_box(sought: Sought, place: Box) -> manifold3d.Manifold:
+def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
     """Erode, subtract, grow back, clip: all on one grid of signed distances."""
     s, template = sought.evidence.surfels, sought.template
     inside = in_box(s.place_mm, *place.corners_mm) & sought.labelled
@@ -127,7 +123,7 @@ def _limits(
 
 def _grown_back(
     sought: Sought, box: VoxelBox, core: Mask, clip: Values, f_mm: Values
-) -> manifold3d.Manifold:
+) -> list[manifold3d.Manifold]:
     """The core, grown by what the erosion took and clipped to template minus as-built."""
     grow_mm = GROW_FACTOR * sought.tau_mm + float(box.step_mm.max())
     reach = box.distance_to(core.reshape(box.shape)) - grow_mm
@@ -136,19 +132,7 @@ def _grown_back(
     if not sought.is_excess:
         wanted = f_mm.reshape(box.shape) < 0
         field = np.where(_hangs_free(wanted, shaped < 0, field < 0), shaped, field)
-    return solid_from_field(box, _without_crumbs(box, field, sought.options.voxels.crumb_mm3))
-
-
-def _without_crumbs(box: VoxelBox, field_mm: Voxels, least_mm3: float) -> Voxels:
-    """The same without samples that make pieces too small to count, most of them of one alone.
-
-    Marching cubes leaves each corner of a cube at most a third of it, and a sample has eight cubes.
-    """
-    groups, _ = ndimage.label(field_mm < 0, structure=np.ones((3, 3, 3), bool))
-    most_mm3 = 8 / 3 * float(np.prod(box.step_mm)) * np.bincount(groups.ravel())
-    crumb = most_mm3 < least_mm3
-    crumb[0] = False
-    return np.where(crumb[groups], FAR_MM, field_mm)
+    return solids_from_field(box, field, sought.options.voxels.crumb_mm3)
 
 
 def _of_a_region(

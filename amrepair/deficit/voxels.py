@@ -7,13 +7,14 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import ndimage
 from skimage import measure
 
 from amrepair.arrays import Points, VoxelMask, Voxels
 from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
+from amrepair.field.groups import connected
 from gcode.solids import as_manifold, is_valid
 
 SURFACE_STEPS = 4.0  # of a grid: more than the longest way between corners of a cube
@@ -87,27 +88,52 @@ class VoxelBox:
         return np.asarray(ndimage.distance_transform_edt(~mask, sampling=tuple(self.step_mm)))
 
 
-def solid_from_field(box: VoxelBox, field_mm: Voxels) -> manifold3d.Manifold:
-    """The solid where the field is negative, closed at the box's faces.
+def solids_from_field(
+    box: VoxelBox, field_mm: Voxels, least_mm3: float
+) -> list[manifold3d.Manifold]:
+    """Where the field is negative, closed at the box's faces: a solid each that holds together.
+
+    None that is smaller than `least_mm3`; a hollow within one is filled.
 
     Raises
     ------
     DeficitError
-        If the surface is not a valid manifold.
+        If the surface of one is not a valid manifold.
     """
     # exact zeros make triangles without area; a nanometre is far below any tolerance here
     field_mm = np.where(np.abs(field_mm) < 1e-6, 1e-6, field_mm)
     if not (field_mm < 0).any():
-        return manifold3d.Manifold()
+        return []
     limit = box.surface_mm
     padded = np.pad(np.clip(field_mm, -limit, limit), 1, constant_values=limit)
     extract: Any = measure.marching_cubes
     for method in ("lewiner", "lorensen"):
         vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm), method=method)
-        solid: manifold3d.Manifold = as_manifold(vertices + (box.low_mm - box.step_mm), faces)
-        if is_valid(solid):
-            return solid
+        solids = [
+            as_manifold(*surface)
+            for surface in _apart(vertices + (box.low_mm - box.step_mm), faces, least_mm3)
+        ]
+        if all(is_valid(solid) for solid in solids):
+            return solids
     raise DeficitError(
         f"the surface of a defect near {np.round(box.low_mm, 1).tolist()} mm is not a valid solid; "
         "scan again with finer spacing"
     )
+
+
+def _apart(
+    vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], least_mm3: float
+) -> list[tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]]:
+    """Closed surfaces of which none touches another, without what holds too little."""
+    one, other = faces[:, :2].ravel(), faces[:, 1:].ravel()
+    body = connected(one, other, len(vertices_mm))
+    # about a corner near by: large numbers would cancel
+    corner = (vertices_mm - vertices_mm[0])[faces]
+    six_fold_mm3 = np.linalg.det(corner)
+    volume_mm3 = np.bincount(body[faces[:, 0]], six_fold_mm3) / 6.0
+    found = []
+    for large in np.flatnonzero(volume_mm3 >= least_mm3):
+        own = body == large
+        number = np.cumsum(own) - 1
+        found.append((vertices_mm[own], number[faces[own[faces[:, 0]]]]))
+    return found

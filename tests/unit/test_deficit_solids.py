@@ -13,7 +13,7 @@ import pytest
 
 from amrepair.deficit import Deficit, compute_deficit, measured_regions
 from amrepair.deficit.options import VoxelOptions
-from amrepair.deficit.voxels import VoxelBox, solid_from_field
+from amrepair.deficit.voxels import VoxelBox, solids_from_field
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.regions import Label, detect
@@ -402,4 +402,4 @@ def test_a_field_that_touches_zero_by_less_than_a_nanometre_is_no_solid() -> Non
     box = VoxelBox.around(np.zeros(3), np.full(3, 2.0), thickness_mm=0.5, across=2)
     field = np.full(box.shape, 0.3)
     field[2, 2, 2] = -4e-7
-    assert solid_from_field(box, field).is_empty()
+    assert not solids_from_field(box, field, 0.0)
