@@ -187,11 +187,9 @@ def find_occupancy(
     scan = replace(scan, on_mm=on_mm[in_box(on_mm, *box_mm)])
     facets = _facets(grid)
     nats = unseen[facets.axis] * _unexplained(scan, facets, grid.voxel_mm)[:, None]
-    told = _told(scan, grid)
-    cut = _Cut.of(facets, nats, len(told))
-    empty = _with_open_sides(cut.labelled(told), scan, cut, told, grid)
+    cut = _Cut.of(facets, nats, _told(scan, grid))
     solid = np.zeros(grid.number.shape, bool)
-    solid[grid.number >= 0] = ~empty
+    solid[grid.number >= 0] = ~_with_open_sides(scan, cut, grid)
     return Occupancy(grid.low_mm, grid.voxel_mm, _as_seen(solid, scan, grid), grid.f_mm < 0)
 
 
@@ -360,52 +358,73 @@ def _told(scan: _Scanned, grid: _Grid) -> Float[np.ndarray, " v"]:
 
 @dataclass(frozen=True, slots=True)
 class _Cut:
-    """What it costs where one voxel of two that meet is empty, nats; and labellings by that.
+    """The cheapest labelling of voxels, a minimum cut; and those of other prices from there on.
+
+    Of equally cheap ones that with the most solid: empty is what still reaches what is empty for
+    certain once no more flow fits (Ford & Fulkerson 1956).
 
     Attributes
     ----------
     facets, nats
-        Where they meet, (k, 2) of each the price of `one` solid alone, and of `other` alone.
+        Where two voxels meet, (k, 2) of each the price of `one` solid alone, and of `other` alone.
+    told
+        (v,) of each voxel that is empty.
     beyond
-        (2, v) of a voxel that is solid where nothing is beyond it, on the one side and the other.
-    beside, fits
-        (v, 6) voxels before and behind on each axis, −1 where there is none; prices, `UNIT_NATS`.
+        (2, v) of one that is solid where nothing is beyond it, on the one side and the other.
+    beside
+        (v, 6) voxels before and behind on each axis, −1 where there is none.
+    fits, ends
+        (v, 6) to each of them, (v,) from what is solid or, negative, to what is empty: what flow
+        still fits, `UNIT_NATS`.
+    empty
+        (v,) whether each voxel is.
     """
 
     facets: _Facets
     nats: Float[np.ndarray, "k 2"]
+    told: Values
     beyond: Float[np.ndarray, "2 v"]
     beside: Int[np.ndarray, "v 6"]
     fits: Int[np.ndarray, "v 6"]
+    ends: Numbers
+    empty: Mask
 
     @classmethod
-    def of(cls, facets: _Facets, nats: Float[np.ndarray, "k 2"], count: int) -> _Cut:
-        """Of so many voxels."""
-        beyond = np.zeros((2, count))
+    def of(cls, facets: _Facets, nats: Float[np.ndarray, "k 2"], told: Values) -> _Cut:
+        """By what it costs where voxels meet, and what is told of each."""
+        beyond = np.zeros((2, len(told)))
         for mine, none, k in ((facets.one, facets.other, 0), (facets.other, facets.one, 1)):
             edge = (mine >= 0) & (none < 0)  # what lies beyond is empty: solid ends here
-            beyond[k] = np.bincount(mine[edge], nats[edge, k], minlength=count)
-        whole = facets.one, facets.other, facets.axis, _in_units(nats), count
-        return cls(facets, nats, beyond, *kernels.joined(*whole))
+            beyond[k] = np.bincount(mine[edge], nats[edge, k], minlength=len(told))
+        whole = facets.one, facets.other, facets.axis, _in_units(nats), len(told)
+        beside, fits = kernels.joined(*whole)
+        ends = _in_units(told - beyond[0] - beyond[1])
+        empty = kernels.flow(beside, fits, ends) == kernels.EMPTY
+        return cls(facets, nats, told, beyond, beside, fits, ends, empty)
 
     def labelled(self, told: Values) -> Mask:
-        """(v,) whether each voxel is empty in the cheapest labelling: a minimum cut.
-
-        Of equally cheap ones that with the most solid: empty is what still reaches what is empty
-        for certain once no more flow fits (Ford & Fulkerson 1956).
-        """
-        for nats in self.beyond:
-            told = told - nats
-        return np.asarray(
-            kernels.flow(self.beside, self.fits.copy(), _in_units(told)) == kernels.EMPTY
+        """(v,) what is empty where voxels are less surely solid."""
+        before, now = (
+            _in_units(each - self.beyond[0] - self.beyond[1]) for each in (self.told, told)
         )
+        ends = self.ends + now - before
+        return np.asarray(kernels.flow(self.beside, self.fits.copy(), ends) == kernels.EMPTY)
 
-    def cost(self, empty: Mask, told: Values) -> float:
+    def cost(self, empty: Mask) -> float:
         """Of a labelling, nats."""
         solid = np.append(~empty, False)
         one, other = solid[self.facets.one], solid[self.facets.other]
         surface = self.nats[one & ~other, 0].sum() + self.nats[other & ~one, 1].sum()
-        return float(told[empty].sum() + surface)
+        return float(self.told[empty].sum() + surface)
+
+    def least_rise(self, told: Values) -> float:
+        """How much more any labelling costs at least in which what is told to be is empty, nats.
+
+        Whatever flow still comes from there is cut, but for half a unit of each price.
+        """
+        surely = told <= -MOST_NATS
+        rise = float(np.maximum(self.ends[surely], 0).sum()) - 0.5 * (self.nats.size + len(told))
+        return max(rise * UNIT_NATS, 0.0)
 
 
 def _in_units(nats: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
@@ -476,8 +495,8 @@ class _Sides:
             yield np.where(room == k, -MOST_NATS, told)
 
 
-def _with_open_sides(empty: Mask, scan: _Scanned, cut: _Cut, told: Values, grid: _Grid) -> Mask:
-    """The same, or a cheaper labelling in which broken surface has an open side.
+def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid) -> Mask:
+    """What is empty by a cut, or by a cheaper labelling in which broken surface has an open side.
 
     As much of it as is around a bead must have none, or it stays.
     """
@@ -485,8 +504,9 @@ def _with_open_sides(empty: Mask, scan: _Scanned, cut: _Cut, told: Values, grid:
     least = np.pi * (scan.options.bead_mm / scan.spacing_mm) ** 2
 
     def cost(labels: Mask) -> float:
-        return cut.cost(labels, told) + float(sides.price * sides.is_shut(labels).sum())
+        return cut.cost(labels) + float(sides.price * sides.is_shut(labels).sum())
 
+    empty = cut.empty
     if sides.is_shut(empty).sum() < least:
         return empty
     within = grid.number >= 0
@@ -500,7 +520,9 @@ def _with_open_sides(empty: Mask, scan: _Scanned, cut: _Cut, told: Values, grid:
     uncut &= ~ndimage.binary_dilation(scanned, np.ones((3, 3, 3), bool))
     room = ndimage.label(uncut)[0][within]
     best, least_cost = empty, cost(empty)
-    for proposed in sides.proposed(empty, room, told, least):
+    for proposed in sides.proposed(empty, room, cut.told, least):
+        if cut.cost(empty) + cut.least_rise(proposed) > least_cost:
+            continue
         tried = cut.labelled(proposed)
         if (price := cost(tried)) < least_cost:
             best, least_cost = tried, price
