@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Int
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import faces_kernels as kernels
 from amrepair.field.fused import Surfels
-from amrepair.field.near import has_near
 from amrepair.field.occupancy import Broken, Occupancy, find_occupancy
 from amrepair.field.options import EvidenceOptions, FaceOptions
 from amrepair.field.places import PlaceTree
@@ -227,7 +226,7 @@ def _looked_at(
     sigma_mm = max(scan.sigma_mm, surfels.spread_mm)
 
     def around(places_mm: Points) -> Mask:
-        return has_near(surfels.place_mm, places_mm, options.around_mm)
+        return surfels.tree.beside(places_mm, options.around_mm)
 
     def looked_at(cells: Mask) -> tuple[Mask, _Places]:
         chosen = np.zeros(len(scan.points_mm), bool)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from amrepair.arrays import Numbers, Points
+from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field import places_kernels as kernels
 
 
@@ -55,6 +55,11 @@ class PlaceTree:
     def nearest_one(self, points_mm: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, " m"]:
         """(m,) number of the nearest place."""
         return self.nearest(points_mm, 1)[1][:, 0]
+
+    def beside(self, points_mm: Float[np.ndarray, "m 3"], within_mm: float) -> Mask:
+        """(n,) whether any of some points lies within a distance of each place."""
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        return kernels.beside(points, self.order, self.nodes, within_mm)
 
     def neighbours(self, count: int) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
         """(n, k) distances and numbers of the places nearest to each place, itself among them."""

@@ -141,3 +141,28 @@ def nearest(points, order, tree, count, within, most):
             for j in range(count):
                 distance[i, j], index[i, j] = np.sqrt(near2[j]), order[near[j]]
     return distance, index
+
+
+@njit(cache=True, nogil=True)
+def beside(points, order, tree, within):
+    """(n,) whether any of the points lies within a distance of each place."""
+    ordered, box, child, first, last = tree
+    found = np.zeros(len(ordered), np.bool_)
+    stack, within2 = np.empty(STACKED, np.int32), within * within
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        stack[0], top = 0, 1
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            if _apart2(x, y, z, box, node) > within2:
+                continue
+            if child[node] >= 0:
+                stack[top], stack[top + 1] = child[node], child[node] + 1
+                top += 2
+                continue
+            for p in range(first[node], last[node]):
+                dx, dy, dz = ordered[p, 0] - x, ordered[p, 1] - y, ordered[p, 2] - z
+                if dx * dx + dy * dy + dz * dz <= within2:
+                    found[order[p]] = True
+    return found
