@@ -32,6 +32,7 @@ SENSORS = (1, 1, 6, 14)  # one view, or a whole part
 SPACING_MM, MOST_POINTS = (0.35, 0.7), 60_000
 KNOT_SHARE = 0.4  # of the length over which errors hang together: so far apart lie their knots
 FREEDOMS = 4.0  # of Student's t: its fourth moment is infinite
+UNSEEN_MM = 1.0  # so far from any point of any view nobody saw the reference's surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,7 @@ class RealScans:
         points = np.vstack([view.points_mm for view in self.views])
         off = unfollowed(points, surface.deviation_mm(points))
         self._off = np.split(off, np.cumsum([len(v.points_mm) for v in self.views])[:-1])
+        self._followed = cKDTree(points[~off])
         self._seen = []
         for view in self.views:
             as_read = read_scan(folder / view.image.name, frame="scanner")
@@ -94,6 +96,14 @@ class RealScans:
                 sensor = sensor + view.pose[:3, 3]
             edge = as_read.edge if as_read.edge is not None else np.zeros(len(as_read), np.uint8)
             self._seen.append((sensor, edge))
+
+    def unseen_share(self, places_mm: np.ndarray) -> float:
+        """How much of some of the reference's surface no view ever saw: there it is a guess.
+
+        A ray that passes through a guess says that it is wrong, not that material is missing.
+        """
+        apart_mm, _ = self._followed.query(places_mm, distance_upper_bound=UNSEEN_MM)
+        return float(np.isinf(apart_mm).mean())
 
     def made(self, number: int) -> Sound:
         """The scan of a number."""
