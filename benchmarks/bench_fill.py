@@ -9,9 +9,11 @@ is lost here is lost in planning, not in a scan. `tests/judge`, which shares no 
 packages, says what its own head reaches and what the text's beads fill.
 
 Walls of the blocks lie along the columns of that field, and end with them. `--off-grid` turns and
-moves each case to five places where they do not: there narrow slots are filled less, and the
-cone comes up to 0.1 mm nearer to walls: half a column each of not knowing where wall and tip are.
-Depth is measured upright: beside a wall that its hexagon overlaps by 0.02 mm it is all the wall.
+moves each case to five places where they do not: turned, narrow slots are filled less, and the cone
+keeps farther off. The judge knows tip and walls by columns of its own, and contact to half of one
+each: what it tells as 0.06 mm on the grid, and 0.16 beside it, is 0.125 in both. So contact of the
+cone is told also where it truly is. Depth is measured upright: beside a wall that its hexagon
+overlaps by 0.02 mm it is all the wall.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from gcode.writer import write
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.bench_judge import make_cut, mesh_of
-from tests.judge import HEADS, judge
+from tests.judge import HEADS, cone_contact_mm, judge
 
 Solid = manifold3d.Manifold
 CELL_MM = 0.1  # as a repair's field of what stands there has it
@@ -175,12 +177,14 @@ def run(
     refused = find_refusals(
         program, setup, as_built=as_built, patch=lines.bridges if lines else True
     )
+    rest, box_mm = mesh_of(case.rest), np.asarray(case.piece.bounding_box()).reshape(2, 3)
+    head = HEADS[setup.printer.id]
     verdict = judge(
         program.text,
-        mesh_of(case.rest),
+        rest,
         mesh_of(case.whole),
-        np.asarray(case.piece.bounding_box()).reshape(2, 3),
-        head=HEADS[setup.printer.id],
+        box_mm,
+        head=head,
         nozzle_mm=setup.printer.nozzle_diameter_mm,
     )
     causes: dict[str, float] = {}
@@ -200,6 +204,7 @@ def run(
         "in_air_mm3": verdict.in_air_mm3,
         "widest_mm": verdict.widest_mm,
         "contact_mm": verdict.deepest_contact_mm if plan.beads_mm3 else 0.0,
+        "cone_mm": cone_contact_mm(program.text, rest, box_mm, head) if plan.beads_mm3 else 0.0,
         "declared": plan.reachable_mm3 / case.piece.volume(),
         "beads_mm3": plan.beads_mm3,
         "refused": len(refused),
@@ -215,7 +220,7 @@ def line_of(row: dict[str, Any]) -> str:
         f"| {row['case']} | {row['printer']} | {row['missing_mm3']:.0f} | {row['reached']:.2f},"
         f" {row['open']:.2f} | {row['declared']:.2f} | {row['filled']:.3f},"
         f" {row['filled_high']:.3f}, {row['filled_open']:.3f} | {row['outside']:.3f},"
-        f" {row['in_air_mm3']:.1f} | {row['contact_mm']:.2f} |"
+        f" {row['in_air_mm3']:.1f} | {row['contact_mm']:.2f}, {row['cone_mm']:.3f} |"
         f" {row['refused']} | {row['seconds']:.2f} | {left} |"
     )
 
@@ -232,7 +237,7 @@ def page_row(row: dict[str, Any]) -> tuple[object, ...]:
 HEADER = (
     "| cut | printer | missing, mm³ | judge's head reaches: where something holds, at all |"
     " declared | filled of what is held, half a layer up, a whole one; of all | outside, and in"
-    " the air, mm³ | contact, mm | refused | processor, s |"
+    " the air, mm³ | contact, mm, by columns and of the cone where it is | refused | processor, s |"
     " left out, mm³, and why |\n|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
@@ -266,9 +271,10 @@ def main() -> None:
                         file.write(json.dumps(row) + "\n")
             if args.off_grid and rows:
                 filled = [row["filled_open"] for row in rows]
-                deepest_mm = max(row["contact_mm"] for row in rows)
+                by_columns, truly = (max(row[k] for row in rows) for k in ("contact_mm", "cone_mm"))
                 print(
-                    f"{name}, {printer}: {np.mean(filled):.3f} filled, contact {deepest_mm:.2f} mm"
+                    f"{name}, {printer}: {np.mean(filled):.3f} filled,"
+                    f" contact {by_columns:.2f}, of the cone {truly:.3f} mm"
                 )
     if args.page and not args.off_grid:
         from measured_page import write_rows  # beside this script

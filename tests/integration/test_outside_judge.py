@@ -21,7 +21,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
-from tests.judge import HEADS, Verdict, judge
+from tests.judge import HEADS, Verdict, cone_contact_mm, judge
 
 NOISE_MM, SPACING_MM = 0.04, 0.2
 ON_BED_MM = np.array([95.0, 85.0, 0.0])
@@ -193,3 +193,15 @@ def test_the_judge_sees_the_head_run_into_a_wall() -> None:
     near, far = "G1 Z2.2\nG1 X66.5 Y55\nG1 Y65\n", "G1 Z2.2\nG1 X30 Y55\nG1 Y65\n"
     assert judge(near, _mesh(stands), _mesh(stands), box).deepest_contact_mm > 1.0
     assert judge(far, _mesh(stands), _mesh(stands), box).deepest_contact_mm < 0.2
+
+
+@pytest.mark.parametrize("aside_mm", [0.0, 0.03, 0.05, 0.08])
+def test_contact_of_the_cone_is_told_however_walls_lie_to_columns(aside_mm: float) -> None:
+    # regression: tip and wall were known by columns, and 0.125 mm was told as 0.06, or as 0.16
+    stands = _box((20.0, 20.0, 2.0), (50.0, 50.0, 0.0))
+    stands += _box((2.0, 20.0, 2.8), (68.0 + aside_mm, 50.0, 0.0))
+    box = np.array([[64.0, 54.0, 2.0], [68.0, 58.0, 2.2]])
+    # 0.6 mm over the tip the cone is 1.1 mm wide
+    text = f"G1 Z2.2\nG1 X{68.0 + aside_mm - 1.1 + 0.083:.3f} Y55\nG1 Y57\n"
+    told = cone_contact_mm(text, _mesh(stands), box, HEADS["prusa_mk3s"])
+    assert told == pytest.approx(0.083, abs=0.011)

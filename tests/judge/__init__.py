@@ -6,7 +6,7 @@ head ran into.
 """
 
 from tests.judge.head import HEADS, MK3S_HEAD, HeadSlice, reachable
-from tests.judge.judge import Verdict, judge
+from tests.judge.judge import Verdict, cone_contact_mm, judge
 from tests.judge.text import Steps, read_steps
 from tests.judge.voxels import Voxels, occupancy
 
@@ -17,6 +17,7 @@ __all__ = [
     "Steps",
     "Verdict",
     "Voxels",
+    "cone_contact_mm",
     "judge",
     "occupancy",
     "reachable",

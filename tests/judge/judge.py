@@ -17,6 +17,7 @@ from tests.judge.voxels import Voxels, column_tops, occupancy
 FINE_MM = (0.1, 0.1, 0.05)
 STEP_MM = 0.1
 MARGIN_MM = 3.0
+SHARP_MM = 0.02
 # What falls farther than this below the tip hangs, or was blown: it is laid at the tip instead.
 MOST_GAP_MM = 0.55
 HANGING_MM = 0.2
@@ -261,6 +262,58 @@ def _contact(
         if depth > worst:
             worst, line = depth, int(steps.line[at])
     return float(worst), line
+
+
+def cone_contact_mm(
+    text: str, stands: trimesh.Trimesh, piece_box_mm: np.ndarray, head: tuple[HeadSlice, ...]
+) -> float:
+    """Deepest contact of the head's cones over the piece and beside it, −∞: there are none.
+
+    The tip is where the text has it, and walls stand where they are to `SHARP_MM`; the verdict's
+    own figure knows both by columns of 0.1 mm, and is off by up to half of one each.
+    """
+    steps = read_steps(text)
+    low, high = piece_box_mm[0, :2] - MARGIN_MM, piece_box_mm[1, :2] + MARGIN_MM
+    tops = _tops(stands, low, high, SHARP_MM)
+    return max(
+        (
+            _deepest_cone(
+                steps.start_mm, steps.end_mm, tops, low, SHARP_MM, part.above_mm, part.radius_mm,
+                part.radius_to_mm,
+                (part.to_mm - part.above_mm) / (part.radius_to_mm - part.radius_mm),
+            )
+            for part in head
+            if part.radius_to_mm > 0
+        ),
+        default=-np.inf,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _deepest_cone(starts, ends, tops, low, cell, above, rim, rim_to, rise):
+    worst, highest = -np.inf, tops.max()
+    nx, ny = tops.shape
+    for m in range(len(starts)):
+        d = ends[m] - starts[m]
+        count = max(1, int(np.ceil(np.sqrt((d * d).sum()) / STEP_MM)))
+        for s in range(count + 1):
+            p = starts[m] + d * (s / count)
+            over = highest - p[2] - above - max(worst, 0.0)
+            if over <= 0:
+                continue
+            far = min(rim_to, rim + over / rise)
+            x, y = (p[0] - low[0]) / cell - 0.5, (p[1] - low[1]) / cell - 0.5
+            n = far / cell
+            for i in range(max(0, int(np.ceil(x - n))), min(nx, int(np.floor(x + n)) + 1)):
+                wide = np.sqrt(n * n - (i - x) ** 2)
+                for j in range(
+                    max(0, int(np.ceil(y - wide))), min(ny, int(np.floor(y + wide)) + 1)
+                ):
+                    depth = tops[i, j] - p[2] - above
+                    if depth > worst:
+                        apart = np.sqrt((i - x) ** 2 + (j - y) ** 2) * cell
+                        worst = max(worst, depth - rise * max(0.0, apart - rim))
+    return worst
 
 
 @njit(cache=True)
