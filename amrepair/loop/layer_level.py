@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import stats
+from scipy.special import stdtrit
 
 from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.policy import USUAL_POLICY
@@ -132,7 +132,7 @@ class LayerLevel:
         if not count:
             return False
         places = layer / count
-        quantile = float(stats.t.isf(0.5 * self.options.false_alarm / places, layer - 1))
+        quantile = -float(stdtrit(layer - 1, 0.5 * self.options.false_alarm / places))
         limit_mm = self.options.tolerance_layers * self.layer_mm
         limit_mm += quantile * self.spread_mm / np.sqrt(count)
         return bool(abs(self.mean_mm[mine].mean()) > limit_mm)

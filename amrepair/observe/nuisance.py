@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import InputError
@@ -296,4 +296,4 @@ def _chance(value: Values, spread: Float[np.ndarray, "q q"], at: Numbers, spare:
     """How probable so large a value is where the truth is zero (Hotelling's test)."""
     within = spread[np.ix_(at, at)]
     size = float(value @ np.linalg.solve(within, value)) / len(value)
-    return float(f_distribution.sf(size, len(value), spare))
+    return float(fdtrc(len(value), spare, size))

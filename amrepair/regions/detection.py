@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field.as_built import Evidence, gather, with_stubs
@@ -219,7 +219,7 @@ def _stray_limit_mm(level: Level, options: RegionOptions, calibration: Calibrati
     if calibration is not None:
         return tolerance_mm + options.grow_sigmas * float(np.median(level.error_mm))
     stray_mm = np.abs(level.scale.value_mm - level.scale.median_mm)
-    share = 1.0 - 2.0 * float(norm.sf(options.grow_sigmas))
+    share = 1.0 - 2.0 * float(ndtr(-options.grow_sigmas))
     return tolerance_mm + float(np.quantile(stray_mm, share))
 
 

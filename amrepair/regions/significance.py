@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import comb
-from scipy.stats import norm
+from scipy.special import comb, log_ndtr, ndtri
 
 from amrepair.arrays import Numbers, Values
 from amrepair.field import scales_kernels
@@ -31,7 +30,7 @@ from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import Sites
 
 # A quarter of the differences of two standard normal values are smaller: √2 Φ⁻¹(5/8).
-PAIR_QUARTILE = float(np.sqrt(2.0) * norm.ppf(0.625))
+PAIR_QUARTILE = float(np.sqrt(2.0) * ndtri(0.625))
 # Standard error of a median, of that of a mean, for normal noise: √(π/2).
 MEDIAN_LOSS = float(np.sqrt(np.pi / 2))
 # Coordinates in files are rounded to micrometres; no error is smaller.
@@ -342,7 +341,7 @@ def _level(
     # `together` of a window's cells are all as far out: Q^r in any of C(k, r) choices
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
-    quantile = float(norm.isf(min((share / (n * ways)) ** (1.0 / together), 0.5)))
+    quantile = -float(ndtri(min((share / (n * ways)) ** (1.0 / together), 0.5)))
     if statistic == 0 and calibration is None:
         outlying = np.abs(scale.value_mm - scale.median_mm)
         outliers = outlying > np.maximum(OUTLIER_SIGMAS * error_mm, tolerance_mm[0])
@@ -359,7 +358,7 @@ def _level(
         )
         tails.append(tail)
         safe = np.clip(z[side], 0.0, MOST_ERRORS)
-        log_p[side] = np.log(n * ways) + together * norm.logsf(safe)
+        log_p[side] = np.log(n * ways) + together * log_ndtr(-safe)
         critical[side] = quantile
         if tail.scale > 0:
             log_p[side] = np.maximum(log_p[side], tail.log_expected(safe))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from amrepair.arrays import Mask, Points, Values
 from amrepair.errors import InputError
@@ -294,7 +294,7 @@ def _observed(
     sigma_mm[~seen.looked] = np.inf
     value = off_mm / sigma_mm
     variance = np.where(seen.looked, 1.0 + seen.shared, 0.0)
-    alone = float(norm.isf(0.5 * options.stray))
+    alone = -float(ndtri(0.5 * options.stray))
     rising = np.argsort(np.abs(value), kind="stable")
     found = []
     for scale in scales:
@@ -352,7 +352,7 @@ def _beyond_one(
 
 def _null(z: Values, options: SoundTestOptions) -> tuple[float, Tail]:
     """By what factor means of sound places spread, and their tail in units of that."""
-    spread = max(float(np.median(z)) / float(norm.ppf(0.75)), 1e-9)
+    spread = max(float(np.median(z)) / float(ndtri(0.75)), 1e-9)
     start = float(np.quantile(z / spread, 1.0 - options.tail_share))
     beyond = z[z > start * spread] / spread - start
     scale = float(beyond.mean()) if len(beyond) else 0.0

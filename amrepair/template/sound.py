@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
-from scipy.special import digamma, polygamma
-from scipy.stats import norm, t
+from scipy.special import digamma, ndtr, polygamma, stdtrit
 
 from amrepair.errors import InputError
 from amrepair.frames import unit_vectors
@@ -216,10 +215,10 @@ def _summary(
     shrunk = np.sqrt(
         (prior_freedom * prior_deviation**2 + freedom * deviation**2) / np.maximum(whole, 1e-9)
     )
-    share = norm.cdf(TOLERATED_SPREADS)
-    wide = t.ppf(share, np.maximum(whole, 1.0)) / TOLERATED_SPREADS
+    share = ndtr(TOLERATED_SPREADS)
+    wide = stdtrit(np.maximum(whole, 1.0), share) / TOLERATED_SPREADS
     spread = np.where(count > 1, shrunk * np.sqrt(1 + 1 / np.maximum(count, 1)) * wide, 0.0)
-    limit = t.isf(options.outvoted_p / max(int(seen.sum()), 1) / 2, np.maximum(whole, 1.0))
+    limit = -stdtrit(np.maximum(whole, 1.0), options.outvoted_p / max(int(seen.sum()), 1) / 2)
     outvoted = seen & (count > 2) & (np.abs(off) > limit * shrunk * np.sqrt(1 + 1 / count.clip(1)))
     return SoundParts(
         sites, offset, spread, count,
