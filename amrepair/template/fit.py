@@ -23,7 +23,7 @@ from amrepair.template.signs import signed_grid, signs_in_blocks
 from amrepair.template.surface import sample_surface
 from gcode.progress import Progress, silent
 
-FIT_VERSION = 3  # raised where the same mesh gives another template: cached ones are fitted again
+FIT_VERSION = 4  # raised where the same file gives another template: cached ones are fitted again
 AT_ONCE = 100_000  # distances: a second of a large mesh
 
 

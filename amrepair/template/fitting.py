@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from amrepair.template.fit import FIT_VERSION, fit_fast
 from amrepair.template.grid import GridSdf
 from amrepair.template.learned import LEARNED_KIND as LEARNED
 from amrepair.template.learned import LearnedSdf
-from amrepair.template.mesh_file import load_mesh, require_mesh
+from amrepair.template.mesh_file import file_sha256, load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.network import NETWORK_KIND as NETWORK
 from amrepair.template.network import PaperSdf
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import trimesh
 
 RECIPES = ("fast", "paper")
+_log = logging.getLogger(__name__)
 
 
 def fit_template(
@@ -133,21 +135,33 @@ def load_or_fit(
 ) -> GridSdf:
     """The fast template of a part: from the cache, keyed by its hash, or fitted and kept there.
 
+    A file's hash is that of its bytes, so that one that is known is not read as a mesh again; what
+    was mended of it is logged each time.
+
     Parameters
     ----------
     cache_dir
         Default: `$XDG_CACHE_HOME/amrepair/templates`, or `~/.cache/amrepair/templates`.
     """
-    closed = _closed(source, progress)
     folder = cache_dir or default_cache_dir()
-    versions = [FIT_VERSION, FORMAT_VERSION, amrepair.__version__]
-    key = json.dumps([mesh_sha256(closed), "fast", seed, *versions])
+    file = Path(source) if isinstance(source, (str, Path)) else None
+    if file is not None and file.is_file():
+        closed, part = None, [file.suffix.lower(), file_sha256(file)]
+    else:
+        closed = _closed(source, progress)
+        part = ["mesh", mesh_sha256(closed)]
+    key = json.dumps([*part, "fast", seed, FIT_VERSION, FORMAT_VERSION, amrepair.__version__])
     path = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.safetensors"
     if path.is_file():
         try:
-            return GridSdf.load(path)
+            kept = GridSdf.load(path)
         except TemplateError:
             path.unlink(missing_ok=True)  # a crash while it was written, or another version
+        else:
+            if file is not None and (notes := kept.metadata.get("notes")):
+                _log.warning("%s: %s", file.name, notes)
+            return kept
+    closed = _closed(source, progress) if closed is None else closed
     template = fit_fast(
         MeshSdf.from_mesh(closed),
         seed=seed,
