@@ -1,8 +1,9 @@
 """Solids from mesh files, for slicing: read, checked, never guessed.
 
-STL, OBJ, 3MF and PLY, mm, in the build frame. Vertices are joined as far as single precision parts
-them, and bodies that overlap are united, which is said; what is still no closed solid is refused
-in one sentence. Nothing is scaled, turned or filled.
+STL, OBJ and PLY in mm, 3MF in the unit that it tells, in the build frame. Vertices are joined as
+far as single precision parts them; faces that all look inwards are turned and bodies that overlap
+are united, which is said; what is still no closed solid is refused in one sentence. Nothing is
+filled.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gcode.errors import InputError
-from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh
+from gcode.meshes import ClosedMesh, bodies_apart, closed_mesh, mesh_of
 from gcode.meshes_kernels import index_of_corners, paired, put_in_table
 from gcode.solids_kernels import first_of_each
 from gcode.surfaces.sizes import PARSER_ERRORS, in_words
@@ -24,6 +25,7 @@ from gcode.threemf import read_3mf
 
 _log = logging.getLogger(__name__)
 
+TURNED = "turned outside out: its triangles faced inwards"
 SOLID_SUFFIXES = (".stl", ".obj", ".3mf", ".ply")
 WELD_RATIO = 1e-6  # of the extent: STL holds single precision
 EQUAL_DIGITS = 8  # of mm
@@ -75,9 +77,9 @@ def read_solid(path: Path) -> Any:
             f"{path}: the mesh is no closed surface (NotManifold), nor when vertices within "
             f"{WELD_RATIO * extent:.2g} mm are joined; repair it first."
         )
-    if solid.volume() < 0:
-        _log.warning("%s: turned outside out: its triangles faced inwards", path.name)
-        solid = first_closed(vertices, faces[:, ::-1])[0]
+    solid, is_turned = outside_out(solid)
+    if is_turned:
+        _log.warning("%s: %s", path.name, TURNED)
     solid, overlap_mm3 = unite_overlaps(solid)
     if overlap_mm3 > 0:
         _log.warning("%s: bodies overlapped by %.3g mm³ and were united", path.name, overlap_mm3)
@@ -310,6 +312,14 @@ def weld(
     new = np.full(len(vertices_mm), -1, np.int64)
     new[old] = same
     return np.ascontiguousarray(vertices_mm[old[first]]), new[faces]
+
+
+def outside_out(solid: Any) -> tuple[Any, bool]:
+    """A solid whose faces look outwards, and whether it had to be turned around."""
+    if solid.volume() >= 0:
+        return solid, False
+    vertices_mm, faces = mesh_of(solid)
+    return as_manifold(vertices_mm, faces[:, ::-1]), True
 
 
 def unite_overlaps(solid: Any) -> tuple[Any, float]:

@@ -93,6 +93,14 @@ def _least(t, i, least):
     return min(least, abs(t.ends[i]))
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _cut_off(t, i, lost, count):
+    """One more that has no parent."""
+    t.parent[i] = CUT_OFF
+    lost[count] = i
+    return count + 1
+
+
 @njit(cache=True, nogil=True)
 def _pushed(t, i, amount, lost, count):
     """Flow pushed between a voxel and its root; what has no parent any more is lost."""
@@ -104,16 +112,10 @@ def _pushed(t, i, amount, lost, count):
         t.fits[j, way ^ 1] -= sign * amount
         t.fits[i, way] += sign * amount
         if _room(t, mine, j, i, way ^ 1) == 0:
-            t.parent[i] = CUT_OFF
-            lost[count] = i
-            count += 1
+            count = _cut_off(t, i, lost, count)
         i = j
     t.ends[i] -= sign * amount
-    if t.ends[i] == 0:
-        t.parent[i] = CUT_OFF
-        lost[count] = i
-        count += 1
-    return count
+    return _cut_off(t, i, lost, count) if t.ends[i] == 0 else count
 
 
 @njit(cache=True, nogil=True)
@@ -162,9 +164,7 @@ def _adopted(t, lost, count, now, queue, waits, last):
             if _room(t, mine, j, i, way ^ 1) > 0:
                 last = _put(j, queue, waits, last)
             if t.parent[j] == way ^ 1:
-                t.parent[j] = CUT_OFF
-                lost[count] = j
-                count += 1
+                count = _cut_off(t, j, lost, count)
     return last
 
 

@@ -21,10 +21,12 @@ from amrepair.template.options import USUAL_MESH, MeshOptions
 from gcode.meshes import mesh_of
 from gcode.solids import (
     SOLID_SUFFIXES,
+    TURNED,
     are_closed,
     as_manifold,
     first_closed,
     is_valid,
+    outside_out,
     read_triangles,
     unite_overlaps,
 )
@@ -99,7 +101,6 @@ def load_mesh(path: Path | str, options: MeshOptions = USUAL_MESH) -> trimesh.Tr
         _log.warning("%s: %s", path.name, note)
     closed.metadata["notes"] = notes
     closed.metadata["source"] = str(path)
-    closed.metadata["sha256"] = file_sha256(path)
     return closed
 
 
@@ -163,7 +164,9 @@ def close_mesh(
             what = "only triangles without area"
             raise TemplateError(f"the mesh {source} has {what}; export it again")
         solid = _mend(trimesh.Trimesh(vertices, faces, process=False), source, notes, options)
-    solid = _orient(solid, notes)
+    solid, is_turned = outside_out(solid)
+    if is_turned:
+        notes.append(TURNED)
     solid, overlap_mm3 = unite_overlaps(solid)
     if overlap_mm3 > 0:
         notes.append(f"bodies overlapped by {overlap_mm3:.3g} mm³ and were united")
@@ -268,15 +271,6 @@ def _sewn(mesh: trimesh.Trimesh, options: MeshOptions) -> Any:
     same = np.arange(len(mesh.vertices))
     same[np.asarray(sewn.merge_from_vert, np.int64)] = np.asarray(sewn.merge_to_vert, np.int64)
     return m3.Manifold(sewn) if are_closed(same[np.asarray(mesh.faces)]) else m3.Manifold()
-
-
-def _orient(solid: Any, notes: list[str]) -> Any:
-    """Turn an inside-out solid around."""
-    if solid.volume() >= 0:
-        return solid
-    vertices, faces = mesh_of(solid)
-    notes.append("turned outside out: its triangles faced inwards")
-    return as_manifold(vertices, faces[:, ::-1])
 
 
 def require_mesh(mesh: Any, *, source: str) -> trimesh.Trimesh:
