@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import comb, log_ndtr, ndtri
 
-from amrepair.arrays import Numbers, Values
+from amrepair.arrays import Mask, Numbers, Values
 from amrepair.field import scales_kernels
 from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
@@ -304,8 +304,7 @@ def _freedom(
 
     A class too small to be told has those of the one whose value it took.
     """
-    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
-    patch_of = cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
+    patch_of = _patches(scale, options)
     freedom = np.empty(classes)
     last = 1.0
     for k in range(classes):
@@ -345,7 +344,7 @@ def _level(
     if statistic == 0 and calibration is None:
         outlying = np.abs(scale.value_mm - scale.median_mm)
         outliers = outlying > np.maximum(OUTLIER_SIGMAS * error_mm, tolerance_mm[0])
-        if n * comb(usual, RANK) * float(outliers.mean()) ** RANK > share:
+        if n * comb(usual, RANK) * _usual_share(scale, outliers) ** RANK > share:
             quantile = np.inf  # so many outlying cells fall together by chance
     log_p, critical = np.empty_like(z), np.empty(2)
     peaks = tuple(_peaks(scale, side, options.tail_from) for side in z)
@@ -367,6 +366,25 @@ def _level(
         scale, errors, tolerance_mm, error_mm, freedom, z, critical, quantile, log_p,
         (tails[0], tails[1]), (peaks[0], peaks[1]),
     )  # fmt: skip
+
+
+def _usual_share(scale: Scale, outliers: Mask) -> float:
+    """What share of the cells are outliers, but for those that hang together in the largest place.
+
+    Errors are all over a scan, a defect is at one place: counted among them, its own cells would
+    be told as errors.
+    """
+    window, cell = scale.cells_of(outliers)
+    beside = outliers[cell]
+    group = connected(window[beside], cell[beside], len(outliers))
+    largest = int(np.bincount(group[outliers], minlength=1).max())
+    return float((outliers.sum() - largest) / len(outliers))
+
+
+def _patches(scale: Scale, options: RegionOptions) -> Numbers:
+    """(s,) places farther apart than errors hang together, each facing one way."""
+    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
+    return cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
 
 
 def _peaks(scale: Scale, z: Values, start: float) -> Float[np.ndarray, " p"]:

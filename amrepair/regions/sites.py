@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align.sizes import refuse_wrong_scale
-from amrepair.arrays import Mask, Points, Values
+from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.groups import cell_numbers
@@ -32,6 +32,10 @@ from amrepair.template.port import Template
 RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
+# Depths below a place are halved so often, and the place is the surface's nearest as long as the
+# distance is so much of the depth: a grid's field is rounded where two surfaces are as near.
+THICKNESS_HALVINGS = 8
+STILL_NEAREST = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,13 +148,24 @@ def observed(
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     # what is gone leaves no points of its own: the ray that should have ended there says so
-    absent = np.flatnonzero(nearest < 0)
+    absent = np.flatnonzero(~_stands(surface_mm, normals, surfels, nearest))
     found = passed(seen, surface_mm[absent], normals[absent])
     crossed = replace(found, which=absent[found.which])
     shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
     return Observed(
         scan, template, f_mm, keep, surfels, seen, surface_mm, normals, nearest, crossed, shares
     )
+
+
+def _stands(surface_mm: Points, normals: Points, surfels: Surfels, nearest: Numbers) -> Mask:
+    """(m,) whether scanned surface lies on a place, so that no ray need be asked.
+
+    What a thin wall broke off down to lies beside the place, but not on its plane.
+    """
+    off_mm = surfels.place_mm[nearest] - surface_mm
+    height_mm = np.abs(np.einsum("ij,ij->i", off_mm, normals))
+    near = np.einsum("ij,ij->i", off_mm, off_mm) < surfels.cell_mm**2
+    return np.asarray((nearest >= 0) & near & (height_mm < 0.5 * surfels.cell_mm))
 
 
 def sites_of(
@@ -169,7 +184,8 @@ def sites_of(
     feet_mm = surfels.place_mm - aside_mm[:, None] * outward
     crossed = seen.crossed
     crossed_mm = seen.surface_mm[crossed.which]
-    value_mm = np.concatenate([surfels.deviation_mm, -crossed.depth_mm])
+    deep_mm = _at_most_through(template, crossed_mm, seen.normals[crossed.which], crossed.depth_mm)
+    value_mm = np.concatenate([surfels.deviation_mm, -deep_mm])
     # what rays passed has no points of its own: it was seen as most places were
     facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels))))
     typical, faced = (
@@ -200,6 +216,24 @@ def sites_of(
         facing=np.concatenate([facing, faced]),
         pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm]),
     )
+
+
+def _at_most_through(
+    template: Template, surface_mm: Points, normals: Points, depth_mm: Values
+) -> Values:
+    """(c,) how deep below places rays passed, no deeper than the template is thick there.
+
+    What rays saw beyond a thin wall that is gone depends on what stands there. The wall is twice as
+    thick as the way from the place to where another part of the surface is nearer.
+    """
+    least_mm, most_mm = np.zeros(len(depth_mm)), depth_mm.copy()
+    for k in range(THICKNESS_HALVINGS):
+        middle_mm = most_mm if k == 0 else 0.5 * (least_mm + most_mm)
+        inside_mm = -template.distance(surface_mm - middle_mm[:, None] * normals)
+        is_nearest = inside_mm > STILL_NEAREST * middle_mm
+        least_mm = np.where(is_nearest, middle_mm, least_mm)
+        most_mm = np.where(is_nearest, most_mm, middle_mm)
+    return np.minimum(depth_mm, 2.0 * least_mm)
 
 
 def _behind_what_stands(

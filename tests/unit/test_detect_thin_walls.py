@@ -1,0 +1,106 @@
+"""Breaks of walls a few beads thick: nothing deviates by more than half the wall there.
+
+Regression: a chip off a ring 1 mm thick was found to 60 %; of the 12 breaks below three were not
+found at all, and ten without sensors, one of them 20 mm² wide (eight now: cells are as wide as most
+of these walls). What a wall broke down to lay as near to the places that were gone as surface that
+stands; depths of rays beyond it were taken for noise, and its own cells for usual outliers.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import manifold3d as m3
+import numpy as np
+import pytest
+import trimesh
+
+from amrepair.deficit import compute_deficit
+from amrepair.frames import Transform
+from amrepair.regions import detect
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
+from tests.unit.loop_bench import solid_mesh
+
+SIGMA_MM = 0.03
+SENSORS_MM = np.array(
+    [[10, 8, 300], [210, 8, 220], [-190, 38, 220], [10, 208, 220], [30, -192, 220]], dtype=float
+)
+IN_PLACE = Transform.identity("build", "template")
+
+
+def tube(wall_mm: float) -> m3.Manifold:
+    """A box of 20 × 16 × 12 mm, open at the top."""
+    inside = m3.Manifold.cube((20 - 2 * wall_mm, 16 - 2 * wall_mm, 20))
+    return m3.Manifold.cube((20, 16, 12)) - inside.translate((wall_mm, wall_mm, 1))
+
+
+def pieces(wall_mm: float) -> dict[str, m3.Manifold]:
+    """What breaks off: through a wall's rim, a corner of the rim, a bite of a corner, a window."""
+    return {
+        "notch": m3.Manifold.cube((5, 3 * wall_mm, 1.5)).translate((7, -wall_mm, 10.5)),
+        "rim": m3.Manifold.cube((8, 8, 0.6)).translate((-1, -1, 11.4)),
+        "bite": m3.Manifold.sphere(6, 64).translate((0, 0, 16.5)),
+        "deep": m3.Manifold.cube((5, 3 * wall_mm, 4)).translate((7, -wall_mm, 8)),
+    }
+
+
+def seen(solid: m3.Manifold, step_mm: float) -> Scan:
+    """By five sensors, on a bed; a ray every `step_mm`."""
+    bed = trimesh.creation.box(
+        extents=(60, 60, 1), transform=trimesh.transformations.translation_matrix([10, 8, -0.5])
+    )
+    mesh = trimesh.util.concatenate([solid_mesh(solid), bed])
+    middle, rng = np.array([10.0, 8.0, 6.0]), np.random.default_rng(1)
+    across = np.arange(-17.0, 17.0, step_mm)
+    places, index = [], []
+    for k, sensor in enumerate(SENSORS_MM):
+        ahead = (middle - sensor) / np.linalg.norm(middle - sensor)
+        right = np.cross(ahead, [0.3, 0.1, 1.0])
+        right /= np.linalg.norm(right)
+        a, b = (v.ravel()[:, None] for v in np.meshgrid(across, across))
+        ways = middle + a * right + b * np.cross(ahead, right) - sensor
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        origins = np.broadcast_to(sensor, ways.shape)
+        hit, ray, _ = mesh.ray.intersects_location(origins, ways, multiple_hits=False)
+        places.append(hit + ways[ray] * rng.normal(0, SIGMA_MM, len(ray))[:, None])
+        index.append(np.full(len(ray), k))
+    points = np.concatenate(places)
+    return Scan(
+        points, SIGMA_MM, "template", sensors_mm=SENSORS_MM, sensor_index=np.concatenate(index)
+    )
+
+
+@cache
+def template_of(wall_mm: float) -> MeshSdf:
+    return MeshSdf.from_mesh(solid_mesh(tube(wall_mm)))
+
+
+def found_ratio(scan: Scan, wall_mm: float, gone: m3.Manifold) -> float:
+    """What of the piece is found to be missing."""
+    template = template_of(wall_mm)
+    anomaly = detect(scan, template)
+    deficit = compute_deficit(scan, template, anomaly, build_from_template=IN_PLACE)
+    assert deficit.excess_mm3 < 0.05 * gone.volume()
+    return (deficit.missing ^ gone).volume() / gone.volume()
+
+
+@pytest.mark.parametrize("wall_mm", [0.8, 1.2, 1.6])
+@pytest.mark.parametrize("piece", ["notch", "rim", "bite", "deep"])
+def test_what_a_thin_wall_lost_is_found_by_the_rays_that_passed(piece: str, wall_mm: float) -> None:
+    gone = pieces(wall_mm)[piece] ^ tube(wall_mm)
+    ratio = found_ratio(seen(tube(wall_mm) - gone, 0.3), wall_mm, gone)
+    assert ratio > 0.85
+
+
+@pytest.mark.parametrize("piece", ["notch", "deep"])
+def test_without_sensors_it_is_found_where_cells_are_finer_than_the_wall(piece: str) -> None:
+    gone = pieces(1.6)[piece] ^ tube(1.6)
+    scan = seen(tube(1.6) - gone, 0.3)
+    bare = Scan(scan.points_mm, scan.sigma_mm, "template")
+    assert found_ratio(bare, 1.6, gone) > 0.85
+
+
+@pytest.mark.parametrize("wall_mm", [0.8, 1.6])
+def test_a_sound_tube_is_sound(wall_mm: float) -> None:
+    assert detect(seen(tube(wall_mm), 0.3), template_of(wall_mm)).regions == ()
