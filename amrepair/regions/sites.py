@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align.sizes import refuse_wrong_scale
-from amrepair.arrays import Mask, Numbers, Points, Values
+from amrepair.arrays import Mask, Points, Values
 from amrepair.errors import InputError
 from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.groups import cell_numbers
-from amrepair.field.near import nearest_within
+from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import cells_of, diagonal, unit_vectors
 from amrepair.observe.background import ON_PLANE_MM, background
 from amrepair.observe.basis import NuisanceOptions
@@ -80,8 +80,8 @@ class Observed:
         In the template's frame.
     f_mm, keep
         (n,) deviation of each point, and whether it is one of the part.
-    surfels
-        The points of the part, condensed.
+    surfels, outward
+        The points of the part, condensed, and (n, 3) unit vectors away from the template there.
     images
         What rays saw.
     surface_mm, normals
@@ -99,6 +99,7 @@ class Observed:
     f_mm: Values
     keep: Mask
     surfels: Surfels
+    outward: Points
     images: tuple[RangeImage, ...]
     surface_mm: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
@@ -147,25 +148,28 @@ def observed(
     if surfels.spacing_mm > options.spacing_mm:
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
-    # what is gone leaves no points of its own: the ray that should have ended there says so
-    absent = np.flatnonzero(~_stands(surface_mm, normals, surfels, nearest))
+    # A cell speaks of the place nearest to it. Of what is gone none does, not even where a wall
+    # broke down to just below it: the ray that should have ended there says so.
+    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
+    feet_mm = surfels.place_mm - surfels.deviation_mm[:, None] * outward
+    absent = np.flatnonzero(~has_near(surface_mm, feet_mm, surfels.cell_mm))
     found = passed(seen, surface_mm[absent], normals[absent])
     crossed = replace(found, which=absent[found.which])
     shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
     return Observed(
-        scan, template, f_mm, keep, surfels, seen, surface_mm, normals, nearest, crossed, shares
+        scan,
+        template,
+        f_mm,
+        keep,
+        surfels,
+        outward,
+        seen,
+        surface_mm,
+        normals,
+        nearest,
+        crossed,
+        shares,
     )
-
-
-def _stands(surface_mm: Points, normals: Points, surfels: Surfels, nearest: Numbers) -> Mask:
-    """(m,) whether scanned surface lies on a place, so that no ray need be asked.
-
-    What a thin wall broke off down to lies beside the place, but not on its plane.
-    """
-    off_mm = surfels.place_mm[nearest] - surface_mm
-    height_mm = np.abs(np.einsum("ij,ij->i", off_mm, normals))
-    near = np.einsum("ij,ij->i", off_mm, off_mm) < surfels.cell_mm**2
-    return np.asarray((nearest >= 0) & near & (height_mm < 0.5 * surfels.cell_mm))
 
 
 def sites_of(
@@ -175,8 +179,7 @@ def sites_of(
     rounded_up: RoundedUp | None,
 ) -> Sites:
     """Cells and crossed template points, each with what a sound part may depart there."""
-    surfels, template = seen.surfels, seen.template
-    outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
+    surfels, template, outward = seen.surfels, seen.template, seen.outward
     # cells that noise alone put one above the other are one place; no more: at a broken rim of a
     # thin wall the sound surface beside would outvote the break
     half_mm = 0.5 * surfels.cell_mm
