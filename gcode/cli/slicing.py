@@ -88,6 +88,7 @@ def slice_solid(
         "solid_mm3": round(made.solid_mm3, 4),
         "beads_mm3": round(made.beads_mm3, 4),
         "filament_mm": round(cost.filament_mm, 2),
+        "filament_g": round(cost.filament_mm3 * setup.material.density_g_cm3 / 1000, 2),
         "print_time_s": round(cost.print_time_s, 1),
         "first_pass": made.first_pass,
         "left_out": [
@@ -190,7 +191,7 @@ def _tell(result: dict[str, Any], where: str | None) -> None:
     """What was sliced, where it stands, and what is not in it."""
     console.out.print(
         f"{result['gcode']}: {result['beads_mm3']} mm³ of {result['solid_mm3']} mm³ as beads, "
-        f"{result['filament_mm'] / 1000:.2f} m of filament, "
+        f"{result['filament_mm'] / 1000:.2f} m of filament ({result['filament_g']} g), "
         f"{result['print_time_s'] / 60:.1f} min; checked."
     )
     if where is not None:

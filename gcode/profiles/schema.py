@@ -317,7 +317,6 @@ class MaterialProfile(_Profile):
     fan_ratio: Ratio
     flow_ratio: Annotated[float, Field(ge=0.5, le=1.5)] = 1.0
     max_volumetric_mm3_s: Positive
-    shrinkage_ratio: Annotated[float, Field(ge=0, le=0.1)] = 0.0
     repair_first_bead_delta_c: Annotated[float, Field(ge=0, le=30)] = 0.0
     # the longest strand over air: OrcaSlicer's `max_bridge_length`, beyond which it supports them
     max_bridge_mm: Annotated[float, Field(ge=0, le=100)] = 10.0
@@ -347,7 +346,6 @@ class ProcessProfile(_Profile):
     repair_speed_mm_s: Positive
     bridge_speed_mm_s: Positive | None = None  # of strands over air; a repair's where left out
     acceleration_mm_s2: Positive
-    infill_overlap_ratio: Ratio = 0.15
     max_gap_layers: Annotated[float, Field(ge=1, le=4)] = 2.0
     # of ways to lay a patch the best fills most, less what is too much and the time that it takes
     repair_spill_weight: Annotated[float, Field(ge=0, le=10)] = 1.0  # to a volume that is filled

@@ -259,6 +259,7 @@ def test_slice_check_and_estimate_work_together(chipped: dict[str, Path], tmp_pa
     assert sliced.returncode == 0, sliced.stderr
     result = json.loads(sliced.stdout)
     assert result["beads_mm3"] == pytest.approx(40 * 30 * 12, rel=0.02)
+    assert 1.24e-3 < result["filament_g"] / result["beads_mm3"] < 1.3e-3  # PLA, and the skirt
     assert call("check", job, program="gcode").returncode == 0
     broken = tmp_path / "broken.gcode"
     broken.write_text(job.read_text().replace("M109 S215", "M109 S415", 1))

@@ -274,13 +274,13 @@ def test_a_limit_of_zero_is_none(tmp_path: Path) -> None:
                 "type": "filament",
                 "name": "x",
                 "filament_type": ["ASA"],
-                "filament_shrink": ["99.5%"],
+                "filament_density": ["1.08"],
             },
-            ("materials", "shrinkage_ratio", 0.005),
+            ("materials", "density_g_cm3", 1.08),
         ),
         (
-            {"type": "process", "name": "x", "infill_wall_overlap": "23%", "wall_loops": "3"},
-            ("processes", "infill_overlap_ratio", 0.23),
+            {"type": "process", "name": "x", "sparse_infill_density": "23%", "wall_loops": "3"},
+            ("processes", "infill_ratio", 0.23),
         ),
     ],
 )

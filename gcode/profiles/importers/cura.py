@@ -127,7 +127,6 @@ _CURA_RULES: dict[str, Rule] = {
     "speed_topbottom": Rule("processes", "solid_infill_speed_mm_s", limit),
     "speed_layer_0": Rule("processes", "first_layer_speed_mm_s", limit),
     "acceleration_print": Rule("processes", "acceleration_mm_s2", limit),
-    "infill_overlap": Rule("processes", "infill_overlap_ratio", percent),
 }
 CURA = {key: _steady(rule) for key, rule in _CURA_RULES.items()}
 _NO_MACHINE = frozenset({"fdmprinter", "custom"})  # definitions of anybody's printer

@@ -174,13 +174,6 @@ def percent(text: str, source: Source) -> float:
     return number(first(text).removesuffix("%"), source) / 100.0
 
 
-def share(text: str, source: Source) -> float:
-    """Read `15%` as a ratio; a length in mm has no ratio."""
-    if not first(text).endswith("%"):
-        raise NotMappedError("it is a length, ours is a ratio")
-    return percent(text, source)
-
-
 def of_key(other: str) -> Convert:
     """Read a number, or a share of another key's (`50%` of the perimeters' speed)."""
 

@@ -24,7 +24,6 @@ from gcode.profiles.importers.rules import (
     outline,
     percent,
     script,
-    share,
     whole,
 )
 from gcode.profiles.names import Kind
@@ -114,13 +113,8 @@ PRUSA: dict[str, Rule] = {
     "solid_infill_speed": Rule("processes", "solid_infill_speed_mm_s", of_key("infill_speed")),
     "first_layer_speed": Rule("processes", "first_layer_speed_mm_s", of_key("perimeter_speed")),
     "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
-    "infill_overlap": Rule("processes", "infill_overlap_ratio", share),
     "bridge_speed": Rule("processes", "bridge_speed_mm_s", limit),
 }
-
-
-def _shrink(text: str, source: Source) -> float:
-    return round(1.0 - percent(text, source), 6)
 
 
 _ORCA_SCRIPT = script(
@@ -153,7 +147,6 @@ ORCA: dict[str, Rule] = {
     "overhang_fan_speed": Rule("materials", "bridge_fan_ratio", percent),
     "filament_flow_ratio": Rule("materials", "flow_ratio", number),
     "filament_max_volumetric_speed": Rule("materials", "max_volumetric_mm3_s", limit),
-    "filament_shrink": Rule("materials", "shrinkage_ratio", _shrink),
     "layer_height": Rule("processes", "layer_height_mm", number),
     "initial_layer_print_height": Rule("processes", "first_layer_height_mm", number),
     "line_width": Rule("processes", "line_width_mm", of_key("nozzle_diameter")),
@@ -170,7 +163,6 @@ ORCA: dict[str, Rule] = {
     "internal_solid_infill_speed": Rule("processes", "solid_infill_speed_mm_s", limit),
     "initial_layer_speed": Rule("processes", "first_layer_speed_mm_s", limit),
     "default_acceleration": Rule("processes", "acceleration_mm_s2", limit),
-    "infill_wall_overlap": Rule("processes", "infill_overlap_ratio", share),
     "bridge_speed": Rule("processes", "bridge_speed_mm_s", limit),
 }
 _PRUSA_KINDS: dict[str, Kind] = {
