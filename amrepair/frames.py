@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from amrepair.arrays import Box, Mask, Matrix, Points, Vector
 from amrepair.errors import InputError
 
 # A product of a few float64 rotations stays orthonormal to about 1e-15; files carry 6 digits.
@@ -48,7 +49,7 @@ class Transform:
 
     target: str
     source: str
-    matrix: Float[np.ndarray, "4 4"]
+    matrix: Matrix
 
     def __post_init__(self) -> None:
         matrix = np.array(self.matrix, dtype=np.float64)
@@ -75,12 +76,7 @@ class Transform:
 
     @classmethod
     def from_rotation_translation(
-        cls,
-        target: str,
-        source: str,
-        *,
-        rotation: Float[np.ndarray, "3 3"],
-        translation_mm: Float[np.ndarray, " 3"],
+        cls, target: str, source: str, *, rotation: Float[np.ndarray, "3 3"], translation_mm: Vector
     ) -> Transform:
         """A motion from its (3, 3) rotation and (3,) translation in mm."""
         return cls(target, source, rigid(rotation, translation_mm))
@@ -99,7 +95,7 @@ class Transform:
         return self.matrix[:3, :3]
 
     @property
-    def translation_mm(self) -> Float[np.ndarray, " 3"]:
+    def translation_mm(self) -> Vector:
         """(3,) translation, mm."""
         return self.matrix[:3, 3]
 
@@ -117,18 +113,16 @@ class Transform:
             )
         return Transform(self.target, other.source, self.matrix @ other.matrix)
 
-    def apply(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def apply(self, points_mm: Points) -> Points:
         """(n, 3) points in the target frame, mm."""
         return moved(points_mm, self.matrix)
 
-    def rotate(self, vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def rotate(self, vectors: Points) -> Points:
         """(n, 3) directions in the target frame."""
         return vectors @ self.rotation.T
 
 
-def moved(
-    points_mm: Float[np.ndarray, "n 3"], matrix: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "n 3"]:
+def moved(points_mm: Points, matrix: Matrix) -> Points:
     """(n, 3) points turned and shifted by a homogeneous matrix."""
     out = points_mm @ matrix[:3, :3].T
     for axis in range(3):  # a row of three is too short a loop for numpy: 40 ms of 500,000
@@ -152,7 +146,7 @@ def in_box(
     points_mm: Float[np.ndarray, "n k"],
     low_mm: Float[np.ndarray, " k"],
     high_mm: Float[np.ndarray, " k"],
-) -> Bool[np.ndarray, " n"]:
+) -> Mask:
     """(n,) which points lie in a box, its faces included; axis by axis, an eighth of the time."""
     inside = np.ones(len(points_mm), bool)
     for along, low, high in zip(points_mm.T, low_mm, high_mm, strict=True):
@@ -161,12 +155,12 @@ def in_box(
     return inside
 
 
-def boxes_meet(one: Float[np.ndarray, "2 3"], other: Float[np.ndarray, "2 3"]) -> bool:
+def boxes_meet(one: Box, other: Box) -> bool:
     """Whether two boxes, lowest and highest corner each, have a place in common."""
     return bool((one[0] <= other[1]).all() and (other[0] <= one[1]).all())
 
 
-def unit_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def unit_vectors(vectors: Points) -> Points:
     """The same directions, one long; zero stays zero."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
@@ -178,7 +172,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
     return np.asarray(u @ vt)
 
 
-def rotation_from_vector(vector_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def rotation_from_vector(vector_rad: Vector) -> Float[np.ndarray, "3 3"]:
     """Rotation matrix of an axis-angle vector (Rodrigues), exact near zero."""
     angle_rad = float(np.linalg.norm(vector_rad))
     x, y, z = vector_rad
@@ -206,20 +200,14 @@ def rotation_of_quaternion(wxyz: Float[np.ndarray, " 4 *k"]) -> Float[np.ndarray
     return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
-def rigid(
-    rotation: Float[np.ndarray, "3 3"], translation_mm: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "4 4"]:
+def rigid(rotation: Float[np.ndarray, "3 3"], translation_mm: Vector) -> Matrix:
     """(4, 4) motion that turns about the origin, and then shifts."""
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, translation_mm
     return motion
 
 
-def motion_about(
-    centre_mm: Float[np.ndarray, " 3"],
-    turn_rad: Float[np.ndarray, " 3"],
-    shift_mm: Float[np.ndarray, " 3"],
-) -> Float[np.ndarray, "4 4"]:
+def motion_about(centre_mm: Vector, turn_rad: Vector, shift_mm: Vector) -> Matrix:
     """(4, 4) motion that turns about a place by an axis-angle vector, and then shifts."""
     turn = rotation_from_vector(turn_rad)
     return rigid(turn, centre_mm + shift_mm - turn @ centre_mm)
@@ -243,12 +231,12 @@ def spread_directions(count: int) -> Float[np.ndarray, "k 3"]:
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
 
 
-def diagonal(points_mm: Float[np.ndarray, "n 3"]) -> float:
+def diagonal(points_mm: Points) -> float:
     """Length, from its lowest to its highest corner, of the box of some points; or of a box's."""
     return float(np.linalg.norm(np.ptp(points_mm, axis=0)))
 
 
-def box_corners(bounds_mm: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "8 3"]:
+def box_corners(bounds_mm: Box) -> Float[np.ndarray, "8 3"]:
     """(8, 3) corners of a box, given its lowest and its highest corner."""
     grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
     return np.asarray(bounds_mm[grid, np.arange(3)], dtype=np.float64)

@@ -15,6 +15,7 @@ from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.sizes import other_size, refuse_other_size
 from amrepair.align.thinning import in_order, thin_out
+from amrepair.arrays import Matrix, Points
 from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, in_box, moved, turned_rad
 from amrepair.scans import Scan
@@ -195,7 +196,7 @@ def _as_it_was_seen(
     points = scan.points_mm[some]
     to_sensor = scan.sensors_mm[scan.sensor_index[some]] - points
 
-    def is_possible(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    def is_possible(matrix: Matrix) -> bool:
         placed = moved(points, matrix)
         distance, outward = template.distance_and_gradient(placed)
         near = np.abs(distance) <= found.inlier_mm
@@ -224,7 +225,7 @@ def _refuse_mirrored(
     scan: Scan,
     template: Template,
     found: Found,
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     ratio: float,
     options: AlignOptions,
     rng: np.random.Generator,
@@ -324,10 +325,7 @@ def _from_guess(
 
 
 def _part_only(
-    points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
-    matrix: Float[np.ndarray, "4 4"],
-    options: AlignOptions,
+    points_mm: Points, template: Template, matrix: Matrix, options: AlignOptions
 ) -> Float[np.ndarray, "m 3"]:
     """Points that can lie on the part: in its box, and above the bed."""
     low, high = template.bounds_mm

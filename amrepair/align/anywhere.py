@@ -31,6 +31,7 @@ from amrepair.align.poses import (
 from amrepair.align.refine import Refined
 from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
+from amrepair.arrays import Matrix, Points
 from amrepair.frames import moved, rigid, rotation_from_vector
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -59,9 +60,9 @@ class Found:
     """
 
     best: Refined
-    others: tuple[Float[np.ndarray, "4 4"], ...]
+    others: tuple[Matrix, ...]
     explained_ratio: float
-    part_mm: Float[np.ndarray, "n 3"]
+    part_mm: Points
     left_out_ratio: float
     sigma_mm: float
     inlier_mm: float
@@ -84,12 +85,12 @@ class _Hunt:
     template: Template
     field: CoarseField
     clouds: Clouds
-    part_mm: Float[np.ndarray, "n 3"]
+    part_mm: Points
     sigma_mm: float
     inlier_mm: float
     found: list[Scored] = dataclasses.field(default_factory=list)
     left_out_ratio: float = 0.0
-    twinned: list[Float[np.ndarray, "4 4"]] = dataclasses.field(default_factory=list)
+    twinned: list[Matrix] = dataclasses.field(default_factory=list)
 
     @property
     def best(self) -> Refined:
@@ -101,12 +102,12 @@ class _Hunt:
         """Of the points, on the part in the best pose."""
         return explained(self.best, self.inlier_mm)
 
-    def take(self, starts: Sequence[Float[np.ndarray, "4 4"]]) -> None:
+    def take(self, starts: Sequence[Matrix]) -> None:
         """Refine from more starts."""
         more = refined(starts, self.clouds, self.template, known=self.found)
         self.found = sorted(self.found + more, key=by_score)
 
-    def twins(self) -> list[Float[np.ndarray, "4 4"]]:
+    def twins(self) -> list[Matrix]:
         """Of the best pose, once."""
         if any(not self.clouds.apart(self.best.matrix, known) for known in self.twinned):
             return []
@@ -119,7 +120,7 @@ class _Hunt:
 
 
 def pose_from_anywhere(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     template: Template,
     *,
     sigma_mm: float,
@@ -192,10 +193,7 @@ def pose_from_anywhere(
 
 
 def _measured_mm(
-    points_mm: Float[np.ndarray, "n 3"],
-    clouds: Clouds,
-    options: AlignOptions,
-    rng: np.random.Generator,
+    points_mm: Points, clouds: Clouds, options: AlignOptions, rng: np.random.Generator
 ) -> float:
     """Noise across the surface, up to what can be believed."""
     told = options.explained
@@ -204,11 +202,7 @@ def _measured_mm(
 
 
 def _ask_the_whole(
-    hunt: _Hunt,
-    clouds: Clouds,
-    of_all: list[Scored],
-    points_mm: Float[np.ndarray, "n 3"],
-    least_ratio: float,
+    hunt: _Hunt, clouds: Clouds, of_all: list[Scored], points_mm: Points, least_ratio: float
 ) -> None:
     """Take all points back in where what was left out fits the part as well: it was no clutter."""
     told = hunt.options.explained
@@ -235,9 +229,7 @@ def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
     )  # fmt: skip
 
 
-def _leave_clutter(
-    hunt: _Hunt, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator
-) -> None:
+def _leave_clutter(hunt: _Hunt, points_mm: Points, rng: np.random.Generator) -> None:
     """Search again without what may be clutter; kept where more of the rest lies on the part."""
     options = hunt.options
     for kept in without_clutter(points_mm, rng, options.clutter):
@@ -273,7 +265,7 @@ def _ask_features(hunt: _Hunt) -> None:
         hunt.take([pose.matrix for pose in search(clouds.thinned, hunt.field, only=extra)])
 
 
-def _best_and_others(hunt: _Hunt) -> tuple[Refined, tuple[Float[np.ndarray, "4 4"], ...]]:
+def _best_and_others(hunt: _Hunt) -> tuple[Refined, tuple[Matrix, ...]]:
     """The best pose at its end, and those apart from it that fit as well."""
     clouds, template, options = hunt.clouds, hunt.template, hunt.options.poses
     best_score, best = hunt.found[0]
@@ -281,7 +273,7 @@ def _best_and_others(hunt: _Hunt) -> tuple[Refined, tuple[Float[np.ndarray, "4 4
         best = finished(best, clouds, template, options.dense_iterations)
     beside = slides(best, clouds.dense_mm, 1.5 * options.apart_ratio * clouds.diagonal_mm)
     slid = [pose for _, pose in refined(beside, clouds, template, finish=False)]
-    others: list[Float[np.ndarray, "4 4"]] = []
+    others: list[Matrix] = []
     for score, other in sorted(hunt.found[1:] + on_all(slid, clouds, template), key=by_score):
         if score > hunt.options.explained.as_good * best_score + options.same_fit_mm:
             break
@@ -292,7 +284,7 @@ def _best_and_others(hunt: _Hunt) -> tuple[Refined, tuple[Float[np.ndarray, "4 4
 
 
 def explained_if_mirrored(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     found: Found,
     template: Template,
     options: AlignOptions,
@@ -312,7 +304,7 @@ def _worth_refining(
     effort: Effort,
     *,
     turn: Float[np.ndarray, "3 3"] | None = None,
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Matrix]:
     poses = search(clouds.thinned, field, effort=effort, turn=turn)
     options = field.options
     limit_mm = options.worse * poses[0].score_mm + options.off_cells * field.cell_mm
@@ -321,7 +313,7 @@ def _worth_refining(
     return [pose.matrix for pose in poses[:most] if pose.score_mm <= limit_mm]
 
 
-def _twins(best: Refined, clouds: Clouds, field: CoarseField) -> list[Float[np.ndarray, "4 4"]]:
+def _twins(best: Refined, clouds: Clouds, field: CoarseField) -> list[Matrix]:
     """The pose turned in its template as a box can be, and laid on the box's other sides.
 
     A nearly symmetric part's other poses; a view of one side fits the other one from within, too.
@@ -341,7 +333,7 @@ def _twins(best: Refined, clouds: Clouds, field: CoarseField) -> list[Float[np.n
     return [pose.matrix for pose in poses[: options.most_twins] if pose.score_mm <= limit_mm]
 
 
-def _by_halves(hunt: _Hunt) -> list[Float[np.ndarray, "4 4"]]:
+def _by_halves(hunt: _Hunt) -> list[Matrix]:
     """The pose as each half of the scan alone would have it.
 
     A bent part may be laid between its pieces, where neither lies well; one half is of one piece.
@@ -359,7 +351,7 @@ def _by_halves(hunt: _Hunt) -> list[Float[np.ndarray, "4 4"]]:
     ]
 
 
-def _turns(hunt: _Hunt, rng: np.random.Generator) -> list[Float[np.ndarray, "4 4"]]:
+def _turns(hunt: _Hunt, rng: np.random.Generator) -> list[Matrix]:
     """Starts where poses like the best can turn freely, or nearly."""
     options, clouds = hunt.options, hunt.clouds
     limit = options.explained.as_good * hunt.found[0][0] + options.poses.same_fit_mm

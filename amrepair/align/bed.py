@@ -6,20 +6,17 @@ A layer that is too low all over looks like a part that stands too low; only the
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
 from amrepair.align.options import USUAL_ALIGN, BedOptions
 from amrepair.align.refine import Prior
+from amrepair.arrays import Matrix, Points
 from amrepair.frames import moved, rigid, rotation_from_vector
 from amrepair.template.port import Template
 
 
 def level_on_bed(
-    points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
-    matrix: Float[np.ndarray, "4 4"],
-    options: BedOptions = USUAL_ALIGN.bed,
-) -> tuple[Float[np.ndarray, "4 4"], bool]:
+    points_mm: Points, template: Template, matrix: Matrix, options: BedOptions = USUAL_ALIGN.bed
+) -> tuple[Matrix, bool]:
     """Correct a guess so that the bed that the scan shows lies at the template's lowest height.
 
     Parameters

@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from amrepair.align.options import USUAL_ALIGN, ClutterOptions
+from amrepair.arrays import Mask, Points, Values
 from amrepair.frames import diagonal
 
 
@@ -30,14 +31,12 @@ class Kept:
         Share of the sample that is not among them.
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
+    points_mm: Points
     left_out_ratio: float
 
 
 def without_clutter(
-    points_mm: Float[np.ndarray, "n 3"],
-    rng: np.random.Generator,
-    options: ClutterOptions = USUAL_ALIGN.clutter,
+    points_mm: Points, rng: np.random.Generator, options: ClutterOptions = USUAL_ALIGN.clutter
 ) -> list[Kept]:
     """What may be the part, least left out first; empty where there is no clutter to tell.
 
@@ -74,9 +73,7 @@ def without_clutter(
 
 
 def noise_across(
-    points_mm: Float[np.ndarray, "n 3"],
-    rng: np.random.Generator,
-    options: ClutterOptions = USUAL_ALIGN.clutter,
+    points_mm: Points, rng: np.random.Generator, options: ClutterOptions = USUAL_ALIGN.clutter
 ) -> float:
     """Noise across the surface, mm: what quadrics through nearby points leave.
 
@@ -98,13 +95,12 @@ def noise_across(
 
 
 def _neighbourhoods(
-    cloud: Float[np.ndarray, "n 3"],
-    neighbours: int,
+    cloud: Points, neighbours: int
 ) -> tuple[
-    Float[np.ndarray, " n"],
-    Float[np.ndarray, "n 3"],
-    Float[np.ndarray, " n"],
-    Float[np.ndarray, " n"],
+    Values,
+    Points,
+    Values,
+    Values,
 ]:
     """Reach of the neighbours, their plane's normal, the noise across it, its share of variance."""
     reach, index = cKDTree(cloud).query(cloud, k=[*range(1, neighbours + 1)], workers=2)
@@ -120,13 +116,13 @@ def _neighbourhoods(
 
 
 def _bed(
-    cloud: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    surface: Bool[np.ndarray, " n"],
+    cloud: Points,
+    normals: Points,
+    surface: Mask,
     sigma_mm: float,
     options: ClutterOptions,
     rng: np.random.Generator,
-) -> Bool[np.ndarray, " n"] | None:
+) -> Mask | None:
     """(n,) points of the plane that holds most of the surface, if all the rest is on one side."""
     here = np.flatnonzero(surface)
     kept = cloud[here]
@@ -155,12 +151,7 @@ def _bed(
     return plane if max(above, 1.0 - above) >= options.one_side else None
 
 
-def _pieces(
-    cloud: Float[np.ndarray, "n 3"],
-    mask: Bool[np.ndarray, " n"],
-    gap_mm: float,
-    options: ClutterOptions,
-) -> list[Bool[np.ndarray, " n"]]:
+def _pieces(cloud: Points, mask: Mask, gap_mm: float, options: ClutterOptions) -> list[Mask]:
     """(n,) each, the largest pieces that do not touch, largest first; none if there is but one."""
     here: Int[np.ndarray, " k"] = np.flatnonzero(mask)
     low = cloud[here].min(axis=0)

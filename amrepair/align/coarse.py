@@ -12,22 +12,23 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Matrix, Points, Vector
 from amrepair.frames import nearest_rotation, rigid
 
 VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
 
 
 def poses_between(
-    source_mm: Float[np.ndarray, "n 3"], target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
-) -> Iterator[Float[np.ndarray, "4 4"]]:
+    source_mm: Points, target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
+) -> Iterator[Matrix]:
     """Candidate poses (target from source) of two clouds: features' first, then the axes'."""
     yield from by_features(source_mm, target_mm, diagonal_mm)
     yield from _by_axes(source_mm, target_mm)
 
 
 def by_features(
-    source_mm: Float[np.ndarray, "n 3"], target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
-) -> Iterator[Float[np.ndarray, "4 4"]]:
+    source_mm: Points, target_mm: Float[np.ndarray, "m 3"], diagonal_mm: float
+) -> Iterator[Matrix]:
     """Candidate poses by KISS-Matcher alone; none where it finds no match."""
     for ratio in VOXEL_RATIOS:
         found = _kiss(source_mm, target_mm, ratio * diagonal_mm)
@@ -36,8 +37,8 @@ def by_features(
 
 
 def _kiss(
-    points_mm: Float[np.ndarray, "n 3"], surface_mm: Float[np.ndarray, "m 3"], voxel_mm: float
-) -> Float[np.ndarray, "4 4"] | None:
+    points_mm: Points, surface_mm: Float[np.ndarray, "m 3"], voxel_mm: float
+) -> Matrix | None:
     import kiss_matcher
 
     # Points are taken about their own centres, since the matcher computes in single precision.
@@ -56,9 +57,7 @@ def _kiss(
     return rigid(rotation, target + shift - rotation @ source)
 
 
-def _by_axes(
-    points_mm: Float[np.ndarray, "n 3"], surface_mm: Float[np.ndarray, "m 3"]
-) -> Iterator[Float[np.ndarray, "4 4"]]:
+def _by_axes(points_mm: Points, surface_mm: Float[np.ndarray, "m 3"]) -> Iterator[Matrix]:
     """The 24 rotations that lay box on box."""
     source, target = _axes(points_mm), _axes(surface_mm)
     for turn in cube_rotations():
@@ -66,9 +65,7 @@ def _by_axes(
         yield rigid(rotation, target[1] - rotation @ source[1])
 
 
-def _axes(
-    points_mm: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+def _axes(points_mm: Points) -> tuple[Float[np.ndarray, "3 3"], Vector]:
     centre = points_mm.mean(axis=0)
     axes = np.linalg.eigh(np.cov((points_mm - centre).T))[1]
     if np.linalg.det(axes) < 0:

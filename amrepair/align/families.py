@@ -16,6 +16,7 @@ from amrepair.align.options import FamilyOptions
 from amrepair.align.refine import Refined
 from amrepair.align.search import CoarseField, misfits_mm
 from amrepair.align.thinning import in_order, thin_out
+from amrepair.arrays import Matrix, Points, Vector
 from amrepair.frames import moved, rigid, rotation_from_vector
 from amrepair.template.port import Template
 
@@ -31,21 +32,17 @@ class Motion:
         moves by about 1 mm.
     """
 
-    turn: Float[np.ndarray, " 3"]
-    shift: Float[np.ndarray, " 3"]
+    turn: Vector
+    shift: Vector
 
-    def applied(
-        self, matrix: Float[np.ndarray, "4 4"], centre_mm: Float[np.ndarray, " 3"], step_mm: float
-    ) -> Float[np.ndarray, "4 4"]:
+    def applied(self, matrix: Matrix, centre_mm: Vector, step_mm: float) -> Matrix:
         """(4, 4) the pose after a small step."""
         place = matrix[:3, :3] @ centre_mm + matrix[:3, 3]
         turned = rotation_from_vector(step_mm * self.turn) @ matrix[:3, :3]
         return rigid(turned, place + step_mm * self.shift - turned @ centre_mm)
 
 
-def motions(
-    pose: Refined, cloud_mm: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " 6"], list[Motion]]:
+def motions(pose: Refined, cloud_mm: Points) -> tuple[Float[np.ndarray, " 6"], list[Motion]]:
     """(6,) how much each motion is hindered (Σ f² / σ² after a step of 1 mm), and the motions."""
     centre = cloud_mm.mean(axis=0)
     reach_mm = float(np.linalg.norm(cloud_mm - centre, axis=1).max())
@@ -55,9 +52,7 @@ def motions(
     return values, [Motion(unit[:3] * one[:3], one[3:]) for one in vectors.T]
 
 
-def slides(
-    pose: Refined, cloud_mm: Float[np.ndarray, "n 3"], step_mm: float
-) -> list[Float[np.ndarray, "4 4"]]:
+def slides(pose: Refined, cloud_mm: Points, step_mm: float) -> list[Matrix]:
     """A step along every motion that leaves the residuals within the noise, both ways."""
     centre = cloud_mm.mean(axis=0)
     return [
@@ -70,7 +65,7 @@ def slides(
 
 def best_turns(
     poses: Sequence[Refined],
-    judged_mm: Float[np.ndarray, "n 3"],
+    judged_mm: Points,
     template: Template,
     field: CoarseField,
     *,
@@ -80,7 +75,7 @@ def best_turns(
     off_mm: float,
     options: FamilyOptions,
     rng: np.random.Generator,
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Matrix]:
     """The best poses of each family: those that turn freely, turned once around.
 
     Parameters
@@ -103,7 +98,7 @@ def best_turns(
     step_mm = options.step_ratio * diagonal_mm
     cloud = in_order(thin_out(judged_mm, options.swept_points, rng))
     known: list[Float[np.ndarray, "k 4 4"]] = []
-    found: list[Float[np.ndarray, "4 4"]] = []
+    found: list[Matrix] = []
     for pose in poses:
         if len(known) == options.most_families:
             break
@@ -126,12 +121,12 @@ def best_turns(
 
 def _best_of(
     family: Float[np.ndarray, "k 4 4"],
-    judges_mm: Float[np.ndarray, "n 3"],
+    judges_mm: Points,
     template: Template,
     field: CoarseField,
     cap_mm: float,
     options: FamilyOptions,
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Matrix]:
     """The best poses of a family but for its first, which is known."""
     few = judges_mm[:: len(judges_mm) // options.coarse_points + 1]
     dips = _lowest(misfits_mm(few, family, field, cap_mm))
@@ -141,9 +136,9 @@ def _best_of(
 
 
 def _turned(
-    matrix: Float[np.ndarray, "4 4"],
+    matrix: Matrix,
     motion: Motion,
-    cloud_mm: Float[np.ndarray, "n 3"],
+    cloud_mm: Points,
     share: float,
     diagonal_mm: float,
     options: FamilyOptions,
@@ -176,10 +171,7 @@ def _turned(
 
 
 def _among(
-    matrix: Float[np.ndarray, "4 4"],
-    family: Float[np.ndarray, "k 4 4"],
-    cloud_mm: Float[np.ndarray, "n 3"],
-    within_mm: float,
+    matrix: Matrix, family: Float[np.ndarray, "k 4 4"], cloud_mm: Points, within_mm: float
 ) -> bool:
     few = cloud_mm[:: max(1, len(cloud_mm) // 50)]
     placed = moved(few, matrix)
@@ -187,12 +179,7 @@ def _among(
     return bool(np.linalg.norm(others - placed, axis=2).max(axis=1).min() < within_mm)
 
 
-def _score(
-    cloud_mm: Float[np.ndarray, "n 3"],
-    matrix: Float[np.ndarray, "4 4"],
-    template: Template,
-    cap_mm: float,
-) -> float:
+def _score(cloud_mm: Points, matrix: Matrix, template: Template, cap_mm: float) -> float:
     residual = np.abs(template.distance(moved(cloud_mm, matrix)))
     return float(np.minimum(residual, cap_mm).mean())
 

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.options import PUBLISHED_PAM, PamOptions
 from amrepair.align.registration import Registration
+from amrepair.arrays import Matrix, Points, Vector
 from amrepair.device import open3d
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, diagonal, moved, nearest_rotation, rigid
@@ -39,9 +40,7 @@ class PamError(AlignmentError):
         Of the last iteration.
     """
 
-    def __init__(
-        self, message: str, *, matrix: Float[np.ndarray, "4 4"], loss: float, threshold: float
-    ) -> None:
+    def __init__(self, message: str, *, matrix: Matrix, loss: float, threshold: float) -> None:
         super().__init__(message)
         self.matrix, self.loss, self.threshold = matrix, loss, threshold
 
@@ -58,7 +57,7 @@ class PamResult:
         The unit of its lengths.
     """
 
-    matrix: Float[np.ndarray, "4 4"]
+    matrix: Matrix
     loss: float
     threshold: float
     iterations: int
@@ -66,7 +65,7 @@ class PamResult:
 
 
 def pam(
-    source_mm: Float[np.ndarray, "n 3"],
+    source_mm: Points,
     target_mm: Float[np.ndarray, "m 3"],
     *,
     options: PamOptions = PUBLISHED_PAM,
@@ -121,22 +120,17 @@ def pam(
     )
 
 
-def _in_mm(
-    pose: Float[np.ndarray, "4 4"],
-    start: Float[np.ndarray, " 3"],
-    middle: Float[np.ndarray, " 3"],
-    radius_mm: float,
-) -> Float[np.ndarray, "4 4"]:
+def _in_mm(pose: Matrix, start: Vector, middle: Vector, radius_mm: float) -> Matrix:
     rotation = nearest_rotation(pose[:3, :3])  # ten products of rotations drift
     return rigid(rotation, middle + radius_mm * pose[:3, 3] - rotation @ start)
 
 
-def _cloud(points: Float[np.ndarray, "n 3"]) -> Any:
+def _cloud(points: Points) -> Any:
     o3d = open3d()
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
 
-def _prepare(points: Float[np.ndarray, "n 3"], options: PamOptions) -> tuple[Any, Any]:
+def _prepare(points: Points, options: PamOptions) -> tuple[Any, Any]:
     """Down-sampled cloud and its FPFH."""
     o3d = open3d()
     search = o3d.geometry.KDTreeSearchParamHybrid
@@ -149,11 +143,11 @@ def _prepare(points: Float[np.ndarray, "n 3"], options: PamOptions) -> tuple[Any
 
 
 def _register(
-    moving: Float[np.ndarray, "n 3"],
+    moving: Points,
     target: Float[np.ndarray, "m 3"],
     prepared: tuple[Any, Any] | None,
     options: PamOptions,
-) -> Float[np.ndarray, "4 4"]:
+) -> Matrix:
     """One round: RANSAC on features, then ICP from there."""
     reg = open3d().pipelines.registration
     step = np.eye(4)
@@ -192,10 +186,7 @@ def _register(
 
 
 def _loss(
-    moving: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "m 3"],
-    options: PamOptions,
-    rng: np.random.Generator,
+    moving: Points, target: Float[np.ndarray, "m 3"], options: PamOptions, rng: np.random.Generator
 ) -> float:
     pair = [moving, target]
     if options.loss_on_voxels:

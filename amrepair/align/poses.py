@@ -14,6 +14,7 @@ from jaxtyping import Float
 from amrepair.align.options import PoseOptions
 from amrepair.align.refine import Refined, refine_all
 from amrepair.align.thinning import Thinned
+from amrepair.arrays import Matrix, Points
 from amrepair.frames import box_corners, diagonal, moved
 from amrepair.template.port import Template
 
@@ -22,7 +23,7 @@ from amrepair.template.port import Template
 class Clouds:
     """A scan in several densities, and what its poses are judged by."""
 
-    dense_mm: Float[np.ndarray, "n 3"]
+    dense_mm: Points
     thinned: Thinned
     corners_mm: Float[np.ndarray, "8 3"]
     diagonal_mm: float
@@ -32,7 +33,7 @@ class Clouds:
     @classmethod
     def of(
         cls,
-        points_mm: Float[np.ndarray, "n 3"],
+        points_mm: Points,
         template: Template,
         sigma_mm: float,
         options: PoseOptions,
@@ -67,18 +68,18 @@ class Clouds:
         """With the mean of |f|, each up to the cap."""
         return float(np.minimum(np.abs(pose.residual_mm), self.cap_mm).mean()), pose
 
-    def apart(self, one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
+    def apart(self, one: Matrix, other: Matrix) -> bool:
         """Whether two poses move the scan's box to different places."""
         return self._between_mm(one, other) > self.options.apart_ratio * self.diagonal_mm
 
-    def same(self, one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> bool:
+    def same(self, one: Matrix, other: Matrix) -> bool:
         """Whether two poses are one minimum: no point of either is beyond the noise of the other's.
 
         Closer than `apart`: the two sides of a thin wall are two minima.
         """
         return self._between_mm(one, other) <= self.sigma_mm
 
-    def _between_mm(self, one: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> float:
+    def _between_mm(self, one: Matrix, other: Matrix) -> float:
         away = self.corners_mm @ (one - other)[:3, :3].T + (one - other)[:3, 3]
         return float(np.linalg.norm(away, axis=1).max())
 
@@ -97,7 +98,7 @@ def explained(pose: Refined, inlier_mm: float) -> float:
 
 
 def refined(
-    starts: Sequence[Float[np.ndarray, "4 4"]],
+    starts: Sequence[Matrix],
     clouds: Clouds,
     template: Template,
     *,
@@ -179,7 +180,7 @@ def on_all(poses: Sequence[Refined], clouds: Clouds, template: Template) -> list
 
 
 def _moved(
-    starts: Sequence[Float[np.ndarray, "4 4"]],
+    starts: Sequence[Matrix],
     clouds: Clouds,
     template: Template,
     points: int,

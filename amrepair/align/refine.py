@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align import refine_kernels as kernels
+from amrepair.arrays import Matrix, Points, Values, Vector
 from amrepair.frames import nearest_rotation, rigid
 from amrepair.template.port import Distances, OnGrid
 
@@ -30,8 +31,8 @@ class Prior:
         (3,) each, about and along the template's axes.
     """
 
-    rotation_rad: Float[np.ndarray, " 3"]
-    translation_mm: Float[np.ndarray, " 3"]
+    rotation_rad: Vector
+    translation_mm: Vector
 
     @property
     def information(self) -> Float[np.ndarray, " 6"]:
@@ -53,17 +54,17 @@ class Refined:
         (n,) f at the points.
     """
 
-    matrix: Float[np.ndarray, "4 4"]
+    matrix: Matrix
     information: Float[np.ndarray, "6 6"]
-    residual_mm: Float[np.ndarray, " n"]
+    residual_mm: Values
     converged: bool
     iterations: int
 
 
 def refine(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     template: Distances,
-    matrix: Float[np.ndarray, "4 4"],
+    matrix: Matrix,
     *,
     start_scale_mm: float,
     end_scale_mm: float,
@@ -95,9 +96,9 @@ def refine(
 
 
 def refine_all(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     template: Distances,
-    matrices: Sequence[Float[np.ndarray, "4 4"]],
+    matrices: Sequence[Matrix],
     *,
     start_scale_mm: float,
     end_scale_mm: float,
@@ -141,7 +142,7 @@ def refine_all(
 
 
 def _refine_by_asking(
-    local: Float[np.ndarray, "n 3"],
+    local: Points,
     rotations: Float[np.ndarray, "k 3 3"],
     places: Float[np.ndarray, "k 3"],
     known: Float[np.ndarray, " 6"],

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from amrepair.align import search_kernels as kernels
 from amrepair.align.options import USUAL_ALIGN, CoarseOptions, Effort
 from amrepair.align.thinning import Thinned
+from amrepair.arrays import Box, Matrix, Points, Vector, Voxels
 from amrepair.frames import nearest_rotation, rigid, rotation_of_quaternion
 from amrepair.template.port import Template
 
@@ -40,10 +41,10 @@ class CoarseField:
         That it was made with, and is searched by.
     """
 
-    origin_mm: Float[np.ndarray, " 3"]
+    origin_mm: Vector
     cell_mm: float
-    values: Float[np.ndarray, "x y z"]
-    box_mm: Float[np.ndarray, "2 3"]
+    values: Voxels
+    box_mm: Box
     options: CoarseOptions
 
     @classmethod
@@ -87,7 +88,7 @@ class Pose:
         Mean distance of the points, each up to a cap.
     """
 
-    matrix: Float[np.ndarray, "4 4"]
+    matrix: Matrix
     score_mm: float
 
 
@@ -100,7 +101,7 @@ def search(
     *,
     effort: Effort | None = None,
     turn: Float[np.ndarray, "3 3"] | None = None,
-    only: tuple[Float[np.ndarray, "4 4"], ...] | None = None,
+    only: tuple[Matrix, ...] | None = None,
 ) -> list[Pose]:
     """Poses that fit best, best first, each where no better one is near.
 
@@ -163,10 +164,7 @@ def search(
 
 
 def misfits_mm(
-    points_mm: Float[np.ndarray, "n 3"],
-    matrices: Float[np.ndarray, "k 4 4"],
-    field: CoarseField,
-    cap_mm: float,
+    points_mm: Points, matrices: Float[np.ndarray, "k 4 4"], field: CoarseField, cap_mm: float
 ) -> Float[np.ndarray, " k"]:
     """(k,) the mean of |f|, each up to the cap, of points in many poses; edges are rounded.
 
@@ -189,7 +187,7 @@ def misfits_mm(
     return np.asarray(field.cell_mm * scores)
 
 
-def _rows(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 n"]:
+def _rows(points: Points) -> Float[np.ndarray, "3 n"]:
     return np.ascontiguousarray(points.T, dtype=np.float32)
 
 

@@ -8,8 +8,8 @@ before any work.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Box
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, box_of
 from amrepair.template.port import Template
@@ -22,7 +22,7 @@ SLACK_MM = 1.0
 RAFT_MM = 3.0
 
 
-def box_on_bed(template: Template, placed: Transform) -> Float[np.ndarray, "2 3"]:
+def box_on_bed(template: Template, placed: Transform) -> Box:
     """Lowest and highest corner of the part's box, build frame, mm."""
     vertices, _ = mesh_of(template.solid())
     return box_of(placed.apply(np.asarray(vertices, dtype=np.float64)))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from amrepair.align.thinning_kernels import first_of_voxels, morton_keys
+from amrepair.arrays import Numbers, Points
 from amrepair.frames import box_of
 
 MOST_THINNED = 200_000
@@ -15,9 +16,7 @@ THINNING_ROUNDS, CLOSE_ENOUGH = 12, 0.95
 ORDER_BITS = 7  # 128 cubes along the longest side
 
 
-def thin_out(
-    points_mm: Float[np.ndarray, "n 3"], count: int, rng: np.random.Generator
-) -> Float[np.ndarray, "m 3"]:
+def thin_out(points_mm: Points, count: int, rng: np.random.Generator) -> Float[np.ndarray, "m 3"]:
     """About `count` points, never more: one of each voxel, chosen by the generator."""
     if len(points_mm) <= count:
         return np.array(points_mm, dtype=np.float64)
@@ -60,7 +59,7 @@ class Thinned:
         (n, 3) in any frame.
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
+    points_mm: Points
     rng: np.random.Generator
     _made: dict[int, Float[np.ndarray, "_m 3"]] = field(default_factory=dict)
 
@@ -73,12 +72,12 @@ class Thinned:
         return self._made[count]
 
 
-def in_order(points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def in_order(points_mm: Points) -> Points:
     """The points so that near ones follow each other: a field is asked in half the time."""
     return np.ascontiguousarray(points_mm[order_of(points_mm)])
 
 
-def order_of(points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+def order_of(points_mm: Points) -> Numbers:
     """(n,) numbers of the points in an order in which near ones follow each other."""
     low, high = box_of(points_mm)
     edge_mm = max(float((high - low).max()), 1e-9) / (1 << ORDER_BITS)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Numbers, Points
 from amrepair.errors import InputError
 from amrepair.field.near import nearest_within
 from amrepair.frames import diagonal
@@ -60,7 +61,7 @@ class PartCells:
     def __len__(self) -> int:
         return len(self.place_mm)
 
-    def nearest(self, points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    def nearest(self, points_mm: Points) -> Numbers:
         """(n,) the cell that each point belongs to, −1 where it lies too far off."""
         return nearest_within(points_mm, self.place_mm, REACH_CELLS * self.spacing_mm)
 

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from PIL import Image
 
-from amrepair.bench.samples import GOOD, BenchClass, Points, Sample, SampleCloud
+from amrepair.arrays import Points, Vector
+from amrepair.bench.samples import GOOD, BenchClass, Sample, SampleCloud
 from amrepair.errors import InputError, refused_as_ours
 from amrepair.frames import diagonal
 from amrepair.observe.robust import MAD_TO_SIGMA
@@ -129,7 +130,7 @@ def on_part(grid: Float[np.ndarray, "rows columns 3"]) -> Bool[np.ndarray, "rows
     return np.asarray(seen & off)
 
 
-def _plane(points: Points) -> tuple[Float[np.ndarray, " 3"], float, float] | None:
+def _plane(points: Points) -> tuple[Vector, float, float] | None:
     """Unit normal, offset and standard deviation of the flat that half the points lie on, or None.
 
     Drawn triples, the one with the least median distance (Rousseeuw 1984), then a fit to what lies

@@ -21,18 +21,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.bench.features import coreset, fill_in, fpfh, nearest
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance
 from amrepair.errors import AlignmentError
 
-Extractor = Callable[
-    [Float[np.ndarray, "n 3"]], tuple[Float[np.ndarray, "k d"], Int[np.ndarray, " k"]]
-]
+Extractor = Callable[[Points], tuple[Float[np.ndarray, "k d"], Int[np.ndarray, " k"]]]
 """Features, and which points they are of (all, or the centres of patches)."""
 Aligner = Callable[
-    [Float[np.ndarray, "n 3"], np.random.Generator],
-    tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]],
+    [Points, np.random.Generator],
+    tuple[Points, Values],
 ]
 """Aligned points and each one's distance to the normal surface; raises AlignmentError."""
 
@@ -47,23 +46,17 @@ REWEIGHT_NEIGHBOURS = 3
 SCALE_QUANTILE = 0.99
 
 
-def raw_features(
-    points_mm: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+def raw_features(points_mm: Points) -> tuple[Points, Numbers]:
     """The coordinates themselves, about their mean as in the published readers."""
     return points_mm - points_mm.mean(axis=0), np.arange(len(points_mm))
 
 
-def aligned_raw_features(
-    points_mm: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+def aligned_raw_features(points_mm: Points) -> tuple[Points, Numbers]:
     """The coordinates as alignment left them."""
     return points_mm, np.arange(len(points_mm))
 
 
-def fpfh_features(
-    points_mm: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "n 33"], Int[np.ndarray, " n"]]:
+def fpfh_features(points_mm: Points) -> tuple[Float[np.ndarray, "n 33"], Numbers]:
     """FPFH at the published radii."""
     return fpfh(points_mm, VOXEL_MM), np.arange(len(points_mm))
 
@@ -85,8 +78,8 @@ class Bank:
     scale: float
 
     def scores(
-        self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "q d"], Float[np.ndarray, " q"]]:
+        self, points_mm: Points, rng: np.random.Generator
+    ) -> tuple[Values, Float[np.ndarray, "q d"], Float[np.ndarray, " q"]]:
         """(n,) distances to the bank at all points; features and distances where asked."""
         features, index = self.extract(points_mm)
         chosen = np.sort(rng.permutation(len(index))[:QUERIES])
@@ -151,7 +144,7 @@ class BankModel:
     aligner: Aligner | None
     template_distance: CloudDistance | None = None
 
-    def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
+    def score(self, points_mm: Points, rng: np.random.Generator) -> Scores:
         """Align if asked, ask every bank, average."""
         residual, aligned = None, True
         if self.aligner is not None:
@@ -209,9 +202,7 @@ class BankMethod:
         return BankModel(banks, not self.greedy, aligner)
 
 
-def _try(
-    aligner: Aligner, cloud: Float[np.ndarray, "n 3"], rng: np.random.Generator
-) -> Float[np.ndarray, "n 3"] | None:
+def _try(aligner: Aligner, cloud: Points, rng: np.random.Generator) -> Points | None:
     try:
         return aligner(cloud, rng)[0]
     except AlignmentError:

@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Matrix, Points, Values, Vector
 from amrepair.bench.options import BendOptions
 from amrepair.frames import diagonal, moved, unit_vectors
 from amrepair.template.port import Template
 
 CREASE_MM = 1e-6  # a narrower zone is a crease
 
-Pose = Float[np.ndarray, "4 4"]
+Pose = Matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +46,15 @@ class Pieces:
 
     pose: Pose
     other: Pose | None = None
-    normal: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
-    through_mm: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    normal: Vector = field(default_factory=lambda: np.zeros(3))
+    through_mm: Vector = field(default_factory=lambda: np.zeros(3))
     zone_mm: float = 0.0
 
-    def moved_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def moved_mm(self, points_mm: Points) -> Values:
         """(n,) how far points of the scan, in its frame, were moved with the other piece."""
         return np.asarray(np.linalg.norm(self.motion_mm(points_mm), axis=1))
 
-    def motion_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def motion_mm(self, points_mm: Points) -> Points:
         """(n, 3) by what points of the scan, in its frame, were moved; template frame.
 
         In an evenly bent zone a place has been turned by the share w of the angle that lies before
@@ -71,7 +72,7 @@ class Pieces:
         )
 
     @property
-    def turned(self) -> Float[np.ndarray, " 3"]:
+    def turned(self) -> Vector:
         """By what a place moves that lies 1 mm farther along the normal; nothing in one piece."""
         if self.other is None:
             return np.zeros(3)
@@ -80,10 +81,7 @@ class Pieces:
 
 
 def _motion_mm(
-    whole_mm: Float[np.ndarray, "n 3"],
-    height_mm: Float[np.ndarray, "*k n"],
-    zone_mm: Any,
-    turned: Float[np.ndarray, " 3"],
+    whole_mm: Points, height_mm: Float[np.ndarray, "*k n"], zone_mm: Any, turned: Vector
 ) -> Float[np.ndarray, "*k n 3"]:
     """(*k, n, 3) motions of places at some heights over the middle of a zone, k ways."""
     share = np.clip(height_mm / np.maximum(zone_mm, CREASE_MM) + 0.5, 0.0, 1.0)
@@ -93,7 +91,7 @@ def _motion_mm(
 
 def with_zone(
     pieces: Pieces,
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     template: Template,
     *,
     limit_mm: float,
@@ -147,12 +145,12 @@ class Cut:
     """
 
     gain: float
-    normal: Float[np.ndarray, " 3"]
+    normal: Vector
     height_mm: float
 
 
 def best_cuts(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     template: Template,
     surface_mm: Float[np.ndarray, "m 3"],
     *,

@@ -22,6 +22,7 @@ from scipy.stats import chi2
 from amrepair.align.refine import Prior, refine_all
 from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
+from amrepair.arrays import Mask, Points, Values, Vector
 from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
 from amrepair.bench.options import USUAL_BODIES, BodyOptions
 from amrepair.frames import diagonal, moved, rigid, rotation_from_vector, unit_vectors, ways_across
@@ -34,7 +35,7 @@ def surface_of(template: Template, options: BodyOptions = USUAL_BODIES) -> Float
 
 
 def pieces_of(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     template: Template,
     known: Sequence[Pose],
     sigma_mm: float,
@@ -122,9 +123,7 @@ def _little_bent(pose: Pose, scene: _Scene) -> Pieces:
     return best[1]
 
 
-def _parted(
-    whole: Pose, axis: Float[np.ndarray, " 3"], height_mm: float, scene: _Scene
-) -> tuple[float, Pieces]:
+def _parted(whole: Pose, axis: Vector, height_mm: float, scene: _Scene) -> tuple[float, Pieces]:
     """What is off, and the pieces on either side of a cut: each moved by itself, then the cut."""
     options = scene.options
     cloud = scene.cloud
@@ -201,8 +200,8 @@ class _Pair:
     beyond: float
     standing: Pose
     other: Pose
-    normal: Float[np.ndarray, " 3"]
-    through_mm: Float[np.ndarray, " 3"]
+    normal: Vector
+    through_mm: Vector
 
 
 @dataclass(frozen=True)
@@ -210,7 +209,7 @@ class _Scene:
     """A scan and its template, and how near is on."""
 
     thinned: Thinned
-    cloud: Float[np.ndarray, "n 3"]
+    cloud: Points
     template: Template
     sigma_mm: float
     diagonal_mm: float
@@ -243,11 +242,11 @@ class _Scene:
         share, beyond = self.options.explained_share, self.options.enough_beyond
         return pair.explained > share or pair.beyond > beyond
 
-    def held(self, on: Bool[np.ndarray, " n"]) -> float:
+    def held(self, on: Mask) -> float:
         """Share of the places that are held."""
         return float(self.is_held(on).mean())
 
-    def is_held(self, on: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    def is_held(self, on: Mask) -> Mask:
         """(n,) places that lie on the template with what is around them.
 
         What crosses the template somewhere, a broken face laid on a flat one, is on it in strips.
@@ -268,24 +267,18 @@ class _Scene:
         shift_mm = options.second_ratio * self.diagonal_mm
         return Prior(np.full(3, options.piece_turn_rad), np.full(3, shift_mm))
 
-    def off(self, pose: Pose) -> Float[np.ndarray, " n"]:
+    def off(self, pose: Pose) -> Values:
         """(n,) how far off the template the points lie, in limits; 1 beyond it."""
         distance = np.abs(self.template.distance(moved(self.cloud, pose)))
         return np.asarray(np.minimum(distance / self.limit_mm, 1.0))
 
-    def feet(self, pose: Pose) -> Float[np.ndarray, "n 3"]:
+    def feet(self, pose: Pose) -> Points:
         """(n, 3) places of the template's surface that the points lie over."""
         placed = moved(self.cloud, pose)
         f_mm, gradient = self.template.distance_and_gradient(placed)
         return np.asarray(placed - f_mm[:, None] * unit_vectors(gradient))
 
-    def in_two(
-        self,
-        standing: Pose,
-        other: Pose,
-        normal: Float[np.ndarray, " 3"],
-        through_mm: Float[np.ndarray, " 3"],
-    ) -> Pieces:
+    def in_two(self, standing: Pose, other: Pose, normal: Vector, through_mm: Vector) -> Pieces:
         """Both pieces, and the zone between them as the points tell it."""
         pieces = Pieces(standing, other, normal, through_mm)
         return with_zone(
@@ -325,10 +318,7 @@ class _Scene:
         return [one.matrix for one in found]
 
     def finished(
-        self,
-        pose: Pose,
-        away: Float[np.ndarray, " 3"] | None = None,
-        through_mm: Float[np.ndarray, " 3"] | None = None,
+        self, pose: Pose, away: Vector | None = None, through_mm: Vector | None = None
     ) -> Pose:
         """The pose moved on all points that lie on the template, on its side of the plane."""
         options = self.options
@@ -407,7 +397,7 @@ def _of_the_rest(first: Pose, scene: _Scene) -> Iterator[tuple[Pose, Pose]]:
     yield first, found[int(np.argmax([scene.on(pose, few).mean() for pose in found]))]
 
 
-def _some(points: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
+def _some(points: Points, count: int) -> Float[np.ndarray, "m 3"]:
     return np.ascontiguousarray(points[:: len(points) // count + 1])
 
 
@@ -470,9 +460,7 @@ def _judged(first: Pose, second: Pose, scene: _Scene) -> _Pair | None:
     return _Pair(share, share_beyond, standing, other, away, through)
 
 
-def _hinge(
-    second_from_first: Pose, scene: _Scene
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
+def _hinge(second_from_first: Pose, scene: _Scene) -> tuple[Vector, Vector] | None:
     """Direction of the line about which the second piece was turned, and a point on it.
 
     None where it was turned too little or too much, slid along the line, or the line is far away.

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.bench.coreset_kernels import farthest_first
 from amrepair.device import open3d
 
@@ -24,7 +25,7 @@ TREE_DIMENSIONS = 4
 FILL_NEIGHBOURS = 3
 
 
-def fpfh(points_mm: Float[np.ndarray, "n 3"], voxel_mm: float) -> Float[np.ndarray, "n 33"]:
+def fpfh(points_mm: Points, voxel_mm: float) -> Float[np.ndarray, "n 33"]:
     """(n, 33) FPFH at every point, as Open3D computes it; normals are not oriented."""
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_mm))
@@ -49,7 +50,7 @@ def coreset(
 
 def nearest(
     queries: Float[np.ndarray, "n d"], bank: Float[np.ndarray, "m d"]
-) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+) -> tuple[Values, Numbers]:
     """(n,) distance to the nearest row of the bank, and which row."""
     if bank.shape[1] <= TREE_DIMENSIONS:
         distance, index = cKDTree(bank).query(queries)
@@ -66,10 +67,8 @@ def nearest(
 
 
 def fill_in(
-    points_mm: Float[np.ndarray, "n 3"],
-    chosen: Int[np.ndarray, " k"],
-    values: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, " n"]:
+    points_mm: Points, chosen: Int[np.ndarray, " k"], values: Float[np.ndarray, " k"]
+) -> Values:
     """(n,) values at all points from those at `chosen`: inverse distance, three neighbours."""
     if len(chosen) == len(points_mm):
         full = np.empty(len(points_mm))

@@ -16,8 +16,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
 
+from amrepair.arrays import Numbers
 from amrepair.bench.samples import (
     GOOD,
     UNLABELLED,
@@ -118,7 +118,7 @@ def _columns(path: Path) -> int:
     return len(first.replace(",", " ").split())
 
 
-def _mask_labels(path: Path) -> Int[np.ndarray, " n"]:
+def _mask_labels(path: Path) -> Numbers:
     """(n,) labels of a mask's rows, 0 or 1."""
     if _columns(path) != 1:
         return read_truth(path)[1]

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import align
 from amrepair.align.thinning import order_of
+from amrepair.arrays import Matrix, Points, Values
 from amrepair.bench.bodies import pieces_of, surface_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
@@ -94,12 +95,8 @@ def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
 
 
 def _laid(
-    points_mm: Float[np.ndarray, "n 3"],
-    template: Template,
-    *,
-    sigma_mm: float,
-    rng: np.random.Generator,
-) -> list[Float[np.ndarray, "4 4"]]:
+    points_mm: Points, template: Template, *, sigma_mm: float, rng: np.random.Generator
+) -> list[Matrix]:
     """Poses of points in the template, the best first; a failed alignment is tried again."""
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
     for attempt in range(USUAL_HOUSE.retries):
@@ -146,15 +143,11 @@ def repair_distance(
     )
 
 
-def _mean_distance(mesh: trimesh.Trimesh, points_mm: Float[np.ndarray, "n 3"]) -> float:
+def _mean_distance(mesh: trimesh.Trimesh, points_mm: Points) -> float:
     return float(MeshSdf.from_mesh(mesh).unsigned_distance(points_mm).mean())
 
 
-def smoothed_score(
-    points_mm: Float[np.ndarray, "n 3"],
-    offset_mm: Float[np.ndarray, " n"],
-    sigma_mm: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
+def smoothed_score(points_mm: Points, offset_mm: Values, sigma_mm: Values) -> Values:
     """(n,) |mean offset over near neighbours|, with some of the wider context.
 
     In standard deviations `sigma_mm` of what sound parts leave there.
@@ -185,7 +178,7 @@ class FieldModel:
     template_distance: CloudDistance | None
     surface_mm: Float[np.ndarray, "m 3"]
 
-    def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
+    def score(self, points_mm: Points, rng: np.random.Generator) -> Scores:
         """Align, test, score; what cannot be aligned is not this part."""
         try:
             known = _laid(points_mm, self.template, sigma_mm=self.sigma_mm, rng=rng)

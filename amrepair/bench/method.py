@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
+from amrepair.arrays import Points, Values
 from amrepair.bench.metrics import CloudDistance
 from amrepair.bench.samples import BenchClass
 
@@ -65,9 +66,9 @@ class Scores:
         False where an alignment was tried and failed.
     """
 
-    point: Float[np.ndarray, " n"]
+    point: Values
     whole: float
-    residual_mm: Float[np.ndarray, " n"] | None = None
+    residual_mm: Values | None = None
     aligned: bool = True
 
 
@@ -80,7 +81,7 @@ class Model(Protocol):
         """How far the method's repair template is from the normal shape; None without one."""
         ...
 
-    def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
+    def score(self, points_mm: Points, rng: np.random.Generator) -> Scores:
         """Score a cloud, whatever its pose."""
         ...
 
@@ -113,7 +114,7 @@ def class_input(one: BenchClass, format: str) -> ClassInput:
     return ClassInput(one.name, format, scaled, mesh, noise_mm(scaled[0]), scale)
 
 
-def noise_mm(points_mm: Float[np.ndarray, "n 3"]) -> float:
+def noise_mm(points_mm: Points) -> float:
     """Noise across the surface, from the residuals of planes through ten neighbours.
 
     On flat ground the smallest eigenvalue of k points is σ² χ² with k − 3 degrees of freedom;

@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import InputError
 
 # The bijection costs O(n³): 1,024 points take about 0.1 s.
@@ -43,7 +44,7 @@ class Detection:
 
 def _checked(
     labels: Shaped[np.ndarray, " n"], scores: Shaped[np.ndarray, " m"]
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " m"]]:
+) -> tuple[Numbers, Float[np.ndarray, " m"]]:
     if labels.shape != scores.shape:
         raise InputError(f"there are {len(labels)} labels for {len(scores)} scores; give one each")
     values = np.asarray(scores, dtype=np.float64)
@@ -56,9 +57,7 @@ def _checked(
     return truth.astype(np.int64), values
 
 
-def _steps(
-    labels: Int[np.ndarray, " n"], scores: Float[np.ndarray, " n"]
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+def _steps(labels: Numbers, scores: Values) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """True and false positives at each distinct threshold, highest first: ties move together."""
     order = np.argsort(-scores, kind="stable")
     falling = scores[order]
@@ -124,10 +123,7 @@ class CloudDistance:
 
 
 def cloud_distance(
-    first: Float[np.ndarray, "n 3"],
-    second: Float[np.ndarray, "m 3"],
-    *,
-    rng: np.random.Generator,
+    first: Points, second: Float[np.ndarray, "m 3"], *, rng: np.random.Generator
 ) -> CloudDistance:
     """Chamfer on all points, earth mover's distance on a random subset of equal size."""
     if len(first) == 0 or len(second) == 0:
@@ -142,10 +138,7 @@ def cloud_distance(
 
 
 def earth_movers_distance(
-    first: Float[np.ndarray, "n 3"],
-    second: Float[np.ndarray, "m 3"],
-    *,
-    rng: np.random.Generator,
+    first: Points, second: Float[np.ndarray, "m 3"], *, rng: np.random.Generator
 ) -> float:
     """Mean distance under the optimal bijection of some points (`EMD_POINTS` at most)."""
     count = min(EMD_POINTS, len(first), len(second))
@@ -155,7 +148,7 @@ def earth_movers_distance(
     return float(cost[linear_sum_assignment(cost)].mean())
 
 
-def mean_and_spread(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def mean_and_spread(values: Values) -> tuple[float, float]:
     """Mean and sample standard deviation of what is not NaN (spread 0 for a single value)."""
     known = values[~np.isnan(values)]
     if len(known) == 0:

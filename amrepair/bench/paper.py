@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.options import PUBLISHED_PAM, RELEASED_PAM, PamOptions
 from amrepair.align.pam import PamError, pam
+from amrepair.arrays import Points, Values
 from amrepair.bench.baselines import Aligner
 from amrepair.bench.house import class_template, repair_distance
 from amrepair.bench.method import ClassInput, Model, Scores
@@ -83,7 +84,7 @@ class Target:
         spacing_mm = spacing_of(cloud_mm)
         return cls(cloud_mm, exact, planes(cloud_mm, spacing_mm).normals, spacing_mm)
 
-    def residual(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def residual(self, points_mm: Points) -> Values:
         """(n,) distance to the normal surface, mm."""
         if self.exact is not None:
             return self.exact.unsigned_distance(points_mm)
@@ -101,9 +102,7 @@ def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:
     """PAM for a class, as `BankMethod` wants it."""
     target, options = Target.of(data), pam_options(data.format)
 
-    def place(
-        points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    def place(points_mm: Points, rng: np.random.Generator) -> tuple[Points, Values]:
         matrix = pam(points_mm, target.cloud_mm, options=options, rng=rng).matrix
         placed = moved(points_mm, matrix)
         return placed, target.residual(placed)
@@ -111,7 +110,7 @@ def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:
     return place
 
 
-def top_mean(score: Float[np.ndarray, " n"], count: int) -> float:
+def top_mean(score: Values, count: int) -> float:
     """Mean of the `count` highest scores."""
     count = min(count, len(score))
     return float(np.partition(score, len(score) - count)[len(score) - count :].mean())
@@ -126,7 +125,7 @@ class PaperModel:
     options: PamOptions
     template_distance: CloudDistance | None
 
-    def score(self, points_mm: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> Scores:
+    def score(self, points_mm: Points, rng: np.random.Generator) -> Scores:
         """A(x) = |f(x)|; a cloud that PAM gave up on is scored in its last pose, and counted."""
         aligned = True
         try:

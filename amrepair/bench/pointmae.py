@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Points
 from amrepair.bench.coreset_kernels import farthest_first
 from amrepair.device import torch_device
 from amrepair.errors import InputError
@@ -54,7 +55,7 @@ class PointTransformer:
     has_class_token: bool
 
     def extract(
-        self, points_mm: Float[np.ndarray, "n 3"]
+        self, points_mm: Points
     ) -> tuple[Float[np.ndarray, "g 1152"], Int[np.ndarray, " g"]]:
         """(g, 1152) features of groups, and the (g,) points that the groups are about."""
         import torch

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Numbers, Points
 from amrepair.errors import InputError
 from amrepair.scans import read_scan
 
@@ -43,8 +44,8 @@ class SampleCloud:
         (n,) 0 normal, 1 anomalous; `UNLABELLED` where the data set does not say.
     """
 
-    points: Float[np.ndarray, "n 3"]
-    labels: Int[np.ndarray, " n"]
+    points: Points
+    labels: Numbers
 
     def __post_init__(self) -> None:
         if len(self.points) != len(self.labels):
@@ -52,9 +53,6 @@ class SampleCloud:
                 f"there are {len(self.labels)} labels for {len(self.points)} points; "
                 "the truth file belongs to another cloud"
             )
-
-
-Points = Float[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, slots=True)

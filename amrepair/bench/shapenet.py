@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Numbers, Points
 from amrepair.bench.samples import (
     GOOD,
     BenchClass,
@@ -128,12 +129,12 @@ def load(sample: Sample) -> SampleCloud:
 
 
 def match_labels(
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     rows: Float[np.ndarray, "m 3"],
     labels: Int[np.ndarray, " m"],
     decimals: int,
     path: Path,
-) -> Int[np.ndarray, " n"]:
+) -> Numbers:
     """(n,) labels of the nearest truth rows.
 
     Raises

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Matrix, Points, Vector
 from amrepair.bench.options import USUAL_LABELS, USUAL_MAKING
 from amrepair.bench.samples import Format, SampleCloud
 from amrepair.bench.synth_defects import Part, Size, SynthDefect, damage, make_part
@@ -114,7 +114,7 @@ class _Made:
     kind: str  # good or a defect
     index: int
     single: bool
-    scan_from_template: Float[np.ndarray, "4 4"]
+    scan_from_template: Matrix
 
 
 def synthesize(
@@ -275,7 +275,7 @@ def _made(
     return _Made(cloud, role, kind, index, single, pose)
 
 
-def _side(shape: Shape, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
+def _side(shape: Shape, rng: np.random.Generator) -> Vector:
     """A direction to look from: any for a normal part, towards the defect for a damaged one."""
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -367,14 +367,14 @@ def _pcd_header(count: int, data: str) -> str:
     )
 
 
-def _write_pcd_ascii(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+def _write_pcd_ascii(path: Path, points: Points) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="ascii", newline="\n") as stream:
         stream.write(_pcd_header(len(points), "ascii"))
         np.savetxt(stream, points, fmt="%.6f")
 
 
-def _write_pcd_binary(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+def _write_pcd_binary(path: Path, points: Points) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     head = _pcd_header(len(points), "binary").encode("ascii")
     path.write_bytes(head + points.astype("<f4").tobytes())

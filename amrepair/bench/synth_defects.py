@@ -17,6 +17,7 @@ import manifold3d as m3
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Values, Vector, Vertices
 from amrepair.bench.options import USUAL_MAKING
 from amrepair.bench.synth_views import Rays, SeenSurface, Shape, sample_shape, sensors_around
 from amrepair.errors import InputError
@@ -42,8 +43,8 @@ class SynthDefect(StrEnum):
 class Seed:
     """Where a defect sits: a point that can be seen, its normal, the material below it."""
 
-    point_mm: Float[np.ndarray, " 3"]
-    normal: Float[np.ndarray, " 3"]
+    point_mm: Vector
+    normal: Vector
     thickness_mm: float
 
 
@@ -54,7 +55,7 @@ class Part:
     solid: Any  # manifold3d.Manifold, marked as original
     shape: Shape
     seeds: SeenSurface
-    thickness_mm: Float[np.ndarray, " n"]
+    thickness_mm: Values
 
     @property
     def diagonal_mm(self) -> float:
@@ -62,9 +63,7 @@ class Part:
         return self.shape.diagonal_mm
 
 
-def make_part(
-    vertices_mm: Float[np.ndarray, "v 3"], faces: np.ndarray, rng: np.random.Generator
-) -> Part:
+def make_part(vertices_mm: Vertices, faces: np.ndarray, rng: np.random.Generator) -> Part:
     """A part from a closed mesh; seeds are surface points that some sensor sees."""
     solid = as_manifold(vertices_mm, faces).as_original()
     shape = Shape(vertices_mm, faces, np.zeros((len(faces), 3)))

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from amrepair.arrays import Faces, Mask, Points, Values, Vector, Vertices
 from amrepair.bench.options import USUAL_VIEWING
 from amrepair.device import open3d
 from amrepair.errors import InputError
@@ -32,8 +33,8 @@ class Shape:
         (f, 3) by face corner: 0 where the shape is normal.
     """
 
-    vertices_mm: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices_mm: Vertices
+    faces: Faces
     change_mm: Float[np.ndarray, "f 3"]
 
     @property
@@ -46,11 +47,11 @@ class Shape:
 class SeenSurface:
     """Points on a shape: (n, 3) points, (n, 3) outward normals, (n,) change."""
 
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    change_mm: Float[np.ndarray, " n"]
+    points_mm: Points
+    normals: Points
+    change_mm: Values
 
-    def take(self, chosen: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> SeenSurface:
+    def take(self, chosen: Int[np.ndarray, " k"] | Mask) -> SeenSurface:
         """Some of the points."""
         return SeenSurface(self.points_mm[chosen], self.normals[chosen], self.change_mm[chosen])
 
@@ -71,15 +72,13 @@ class Rays:
     def _pack(self, origins: np.ndarray, directions: np.ndarray) -> Any:
         return self._tensor(np.concatenate([origins, directions], axis=1).astype(np.float32))
 
-    def thickness_mm(self, surface: SeenSurface) -> Float[np.ndarray, " n"]:
+    def thickness_mm(self, surface: SeenSurface) -> Values:
         """(n,) how far the material goes straight below each point."""
         start = surface.points_mm - self._lift_mm * surface.normals
         hit = self._scene.cast_rays(self._pack(start, -surface.normals))["t_hit"].numpy()
         return hit.astype(np.float64) + self._lift_mm
 
-    def seen(
-        self, surface: SeenSurface, sensors_mm: Float[np.ndarray, "k 3"]
-    ) -> Bool[np.ndarray, " n"]:
+    def seen(self, surface: SeenSurface, sensors_mm: Float[np.ndarray, "k 3"]) -> Mask:
         """(n,) whether any sensor sees the point."""
         found = np.zeros(len(surface.points_mm), dtype=bool)
         start = surface.points_mm + self._lift_mm * surface.normals
@@ -117,13 +116,13 @@ def sensors_around(shape: Shape, count: int = USUAL_VIEWING.sensors) -> Float[np
     return _centre(shape) + USUAL_VIEWING.distance_ratio * shape.diagonal_mm * ways
 
 
-def sensor_towards(shape: Shape, direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "1 3"]:
+def sensor_towards(shape: Shape, direction: Vector) -> Float[np.ndarray, "1 3"]:
     """(1, 3) one sensor in that direction from the part's centre."""
     unit = direction / np.linalg.norm(direction)
     return (_centre(shape) + USUAL_VIEWING.distance_ratio * shape.diagonal_mm * unit)[None, :]
 
 
-def _centre(shape: Shape) -> Float[np.ndarray, " 3"]:
+def _centre(shape: Shape) -> Vector:
     low, high = shape.vertices_mm.min(axis=0), shape.vertices_mm.max(axis=0)
     return (low + high) / 2
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from amrepair.align.refine import refine
 from amrepair.align.thinning import thin_out
+from amrepair.arrays import Points, Values, Vector
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, rotation_from_vector, turned_rad
 from amrepair.scans import Scan
@@ -204,7 +205,7 @@ def _level(
     """The bed as the plane of most points, up where the sensors or fewer points are."""
     points = thin_out(scan.points_mm, options.fit_points, rng)
     limit_mm = max(options.plane_mm, 3 * scan.sigma_mm)
-    best: tuple[int, Float[np.ndarray, " 3"], float] = (0, np.array([0.0, 0.0, 1.0]), 0.0)
+    best: tuple[int, Vector, float] = (0, np.array([0.0, 0.0, 1.0]), 0.0)
     for _ in range(options.bed_tries):
         a, b, c = points[rng.choice(len(points), 3, replace=False)]
         normal = np.cross(b - a, c - a)
@@ -242,16 +243,14 @@ def _level(
     return level, float(np.sqrt(((on @ axes[2] - middle @ axes[2]) ** 2).mean()))
 
 
-def _middle(standing: Template) -> Float[np.ndarray, " 3"]:
+def _middle(standing: Template) -> Vector:
     """The mean of what a scanner above would see of the target's top."""
     points, normals = standing.surface_points(1.0)
     top = points[normals[:, 2] > 0.7]
     return np.asarray(top.mean(axis=0))
 
 
-def _turned(
-    angle_rad: float, points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"]
-) -> Transform:
+def _turned(angle_rad: float, points: Points, centre: Vector) -> Transform:
     """Build from level: turned about the vertical, the middle of the points on the target's."""
     rotation = rotation_from_vector(np.array([0.0, 0.0, angle_rad]))
     shift = centre - rotation @ points.mean(axis=0)
@@ -261,9 +260,7 @@ def _turned(
     )
 
 
-def _cost(
-    standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"], cap_mm: float
-) -> float:
+def _cost(standing: Template, pose: Transform, points: Points, cap_mm: float) -> float:
     distance = standing.distance(pose.apply(points))
     return float(np.minimum(np.abs(distance), cap_mm).mean())
 
@@ -274,30 +271,24 @@ class _OnBed:
 
     standing: Template
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         return np.minimum(self.standing.distance(points_mm), points_mm[:, 2])
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         f_mm, gradient = self.standing.distance_and_gradient(points_mm)
         bed = points_mm[:, 2] < f_mm
         up = np.array([0.0, 0.0, 1.0])
         return np.where(bed, points_mm[:, 2], f_mm), np.where(bed[:, None], up, gradient)
 
 
-def _around(flat: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> Any:  # (n,) bool
+def _around(flat: Points, target: Float[np.ndarray, "m 3"]) -> Any:  # (n,) bool
     """Points within the target's box and a margin: the far bed tells no more than the near."""
     low, high = target[:, :2].min(axis=0) - 5.0, target[:, :2].max(axis=0) + 5.0
     return ((flat[:, :2] >= low) & (flat[:, :2] <= high)).all(axis=1)
 
 
 def _fit(
-    points: Float[np.ndarray, "n 3"],
-    standing: Template,
-    guess: Transform,
-    limit_mm: float,
-    first_scale_mm: float,
+    points: Points, standing: Template, guess: Transform, limit_mm: float, first_scale_mm: float
 ) -> Transform:
     """To the next minimum on the field of target and bed."""
     found = refine(
@@ -311,9 +302,7 @@ def _fit(
     return Transform("build", "scanner", found.matrix)
 
 
-def _residual(
-    standing: Template, pose: Transform, points: Float[np.ndarray, "n 3"], cap_mm: float
-) -> float:
+def _residual(standing: Template, pose: Transform, points: Points, cap_mm: float) -> float:
     """Root mean square distance of the points from the target or the bed, whichever is nearer."""
     placed = pose.apply(points)
     off = np.minimum(np.abs(standing.distance(placed)), np.abs(placed[:, 2]))

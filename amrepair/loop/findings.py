@@ -13,6 +13,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Box, PlanePoints, Values
 from amrepair.loop.layer_level import FLOW_TEST, FlowOptions, LayerLevel, lie_off
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, PolicyOptions
@@ -44,7 +45,7 @@ def next_layer(job: Job, layer_index: int | None) -> int | None:
     return layer_index + 1
 
 
-def cover_of(job: Job, layer_index: int | None, box_mm: Float[np.ndarray, "2 3"]) -> Cover:
+def cover_of(job: Job, layer_index: int | None, box_mm: Box) -> Cover:
     """What the next layer lays over a box."""
     layer = next_layer(job, layer_index)
     if layer is None:
@@ -62,11 +63,11 @@ def cover_of(job: Job, layer_index: int | None, box_mm: Float[np.ndarray, "2 3"]
 
 
 def clipped_mm(
-    start: Float[np.ndarray, "n 2"],
-    end: Float[np.ndarray, "n 2"],
+    start: PlanePoints,
+    end: PlanePoints,
     low: Float[np.ndarray, " 2"],
     high: Float[np.ndarray, " 2"],
-) -> Float[np.ndarray, " n"]:
+) -> Values:
     """(n,) length of each segment within an XY box, mm."""
     step = end - start
     enter, leave = np.zeros(len(start)), np.ones(len(start))
@@ -191,9 +192,7 @@ def _owners(
     return found
 
 
-def _whole_defects(
-    regions: Sequence[Region], policy: PolicyOptions = USUAL_POLICY
-) -> Float[np.ndarray, " n"]:
+def _whole_defects(regions: Sequence[Region], policy: PolicyOptions = USUAL_POLICY) -> Values:
     """(n,) volume of the defect that each region is a piece of, mm³."""
     whole_mm3 = np.zeros(len(regions))
     for label in Label:
@@ -247,9 +246,7 @@ def height_mm(region: Region) -> float:
     return float(np.ptp(np.asarray(region.box_mm)[:, 2]))
 
 
-def matching(
-    pieces: Sequence[manifold3d.Manifold], box_mm: Float[np.ndarray, "2 3"]
-) -> manifold3d.Manifold | None:
+def matching(pieces: Sequence[manifold3d.Manifold], box_mm: Box) -> manifold3d.Manifold | None:
     """The piece whose box is nearest to a region's."""
     if not pieces:
         return None
@@ -257,7 +254,7 @@ def matching(
     return pieces[int(np.argmin([np.abs(box - box_mm).max() for box in boxes]))]
 
 
-def reach_of(plan: RepairPlan, box_mm: Float[np.ndarray, "2 3"]) -> float:
+def reach_of(plan: RepairPlan, box_mm: Box) -> float:
     """Share that the nozzle reaches of the patch's region that overlaps a box most.
 
     1 where no patch was planned for it.
@@ -276,8 +273,6 @@ def reach_of(plan: RepairPlan, box_mm: Float[np.ndarray, "2 3"]) -> float:
     return found
 
 
-def _corners(
-    box_mm: Float[np.ndarray, "2 3"],
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def _corners(box_mm: Box) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     (a, b, c), (d, e, f) = np.asarray(box_mm, dtype=np.float64).tolist()
     return (a, b, c), (d, e, f)

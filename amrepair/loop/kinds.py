@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Box, Mask, Matrix, PlanePoints, Values, Vector
 from amrepair.frames import Transform, turned_rad
 from amrepair.loop.findings import matching
 from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
@@ -212,10 +213,7 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> TypeGues
 
 
 def _moved_so(
-    told_mm: Float[np.ndarray, " n"],
-    seen_mm: Float[np.ndarray, " n"],
-    bands: tuple[float, ...],
-    options: KindOptions,
+    told_mm: Values, seen_mm: Values, bands: tuple[float, ...], options: KindOptions
 ) -> bool:
     """Whether surface stands off wherever a motion of all of it has it do so, band by band.
 
@@ -227,7 +225,7 @@ def _moved_so(
     return all(np.median(one) > options.moved_share for one in seen if len(one))
 
 
-def _fitted(moments: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, " 3"], float]:
+def _fitted(moments: Matrix) -> tuple[Vector, float]:
     """Least squares of the last column by the others, from all their products; what it leaves."""
     found = np.linalg.lstsq(moments[:3, :3], moments[:3, 3], rcond=1e-9)[0]
     return found, float(moments[3, 3] - found @ moments[:3, 3])
@@ -294,7 +292,7 @@ def _flow(
     return None
 
 
-def _since(short: Bool[np.ndarray, " n"]) -> tuple[int, float]:
+def _since(short: Mask) -> tuple[int, float]:
     """From which place along the path too little came out, and the share that this tells wrong.
 
     All that was printed before it is taken to be whole, all after it to be short.
@@ -304,17 +302,12 @@ def _since(short: Bool[np.ndarray, " n"]) -> tuple[int, float]:
     return at, float(wrong[at]) / len(short)
 
 
-def _lasts(short: Bool[np.ndarray, " n"]) -> float:
+def _lasts(short: Mask) -> float:
     """Share of places, from the first on, up to where they are best taken to be whole again."""
     return float(np.argmax(np.cumsum(np.where(short, 1, -1))) + 1) / len(short)
 
 
-def _apart(
-    xy_mm: Float[np.ndarray, "n 2"],
-    short: Bool[np.ndarray, " n"],
-    blur_mm: Float[np.ndarray, " n"],
-    options: KindOptions,
-) -> float:
+def _apart(xy_mm: PlanePoints, short: Mask, blur_mm: Values, options: KindOptions) -> float:
     """Share of places that are not as most of those around them: what a region tells wrong.
 
     `blur_mm` is how far away the points lie that a place's height is the mean of: nearer than
@@ -369,9 +362,7 @@ def _of_region(
     return TypeGuess(region.type, 0.95)
 
 
-def _at_rim(
-    plan: RepairPlan, site: Site, box_mm: Float[np.ndarray, "2 3"], options: KindOptions
-) -> bool:
+def _at_rim(plan: RepairPlan, site: Site, box_mm: Box, options: KindOptions) -> bool:
     """Whether a region reaches the part's outline seen from above, a little below its floor."""
     placed = plan.build_from_template
     z = max(float(box_mm[0, 2]) - options.below_layer_mm, 0.5 * float(box_mm[0, 2]))

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
+from amrepair.arrays import Box, Points, Values
 from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.policy import USUAL_POLICY
 from amrepair.regions import Region
@@ -98,8 +99,8 @@ class LayerLevel:
     @classmethod
     def of_points(
         cls,
-        place_mm: Float[np.ndarray, "n 3"],
-        deviation_mm: Float[np.ndarray, " n"],
+        place_mm: Points,
+        deviation_mm: Values,
         z_mm: float,
         layer_mm: float,
         options: FlowOptions = FLOW_TEST,
@@ -125,7 +126,7 @@ class LayerLevel:
         spread = MAD_TO_SIGMA * float(np.median(np.abs(mean[many] - np.median(mean[many]))))
         return cls(cell[many], mean[many], spread, layer_mm, options)
 
-    def is_off(self, box_mm: Float[np.ndarray, "2 3"]) -> bool:
+    def is_off(self, box_mm: Box) -> bool:
         """Whether the layer lies off over a box by more than tolerance and scatter explain."""
         mine = self._within(box_mm)
         count, layer = int(mine.sum()), len(self.cell)
@@ -137,7 +138,7 @@ class LayerLevel:
         limit_mm += quantile * self.spread_mm / np.sqrt(count)
         return bool(abs(self.mean_mm[mine].mean()) > limit_mm)
 
-    def _within(self, box_mm: Float[np.ndarray, "2 3"]) -> Bool[np.ndarray, " p"]:
+    def _within(self, box_mm: Box) -> Bool[np.ndarray, " p"]:
         """Patches whose middles lie in a box; the one around its middle where none does."""
         middle = (self.cell + 0.5) * self.options.patch_mm
         inside = ((middle >= box_mm[0, :2]) & (middle <= box_mm[1, :2])).all(axis=1)

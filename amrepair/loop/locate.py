@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
 from amrepair.align import align
+from amrepair.arrays import Box, Mask, Numbers, PlanePoints, Points, Values
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, box_of, rotation_from_vector
 from amrepair.loop.outlines import outermost
@@ -55,19 +56,17 @@ class _Inset:
     depth_mm: float
 
     @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+    def bounds_mm(self) -> Box:
         return self.whole.bounds_mm
 
     @property
     def bias_mm(self) -> float:
         return self.whole.bias_mm
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         return self.whole.distance(points_mm) + self.depth_mm
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         distance, gradient = self.whole.distance_and_gradient(points_mm)
         return distance + self.depth_mm, gradient
 
@@ -174,15 +173,13 @@ def is_upright(placed: Transform) -> bool:
     return bool(placed.matrix[2, 2] > UPRIGHT)
 
 
-def of_roles(beads: Beads, names: frozenset[str]) -> Bool[np.ndarray, " n"]:
+def of_roles(beads: Beads, names: frozenset[str]) -> Mask:
     """Which beads have one of some roles."""
     which = [k for k, name in enumerate(beads.roles) if name.lower() in names]
     return np.isin(beads.role, which)
 
 
-def _things(
-    start_mm: Float[np.ndarray, "n 2"], end_mm: Float[np.ndarray, "n 2"], half_mm: float
-) -> Int[np.ndarray, " n"]:
+def _things(start_mm: PlanePoints, end_mm: PlanePoints, half_mm: float) -> Numbers:
     """(n,) to which of the connected things, seen from above, each bead belongs; as they begin."""
     low, shape = columns_around(start_mm, end_mm, 2.0, THING_CELL_MM)
     covered = near_lines(
@@ -196,9 +193,7 @@ def _things(
     return np.argsort(np.argsort(first))[number]
 
 
-def _of_what_rises(
-    layer: Int[np.ndarray, " n"], thing: Int[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def _of_what_rises(layer: Numbers, thing: Numbers) -> Mask:
     """Whose thing has more than one layer: a skirt has one; all, where none has more."""
     every = range(int(thing.max(initial=-1)) + 1)
     rises = ndimage.maximum(layer, thing, every) > ndimage.minimum(layer, thing, every)

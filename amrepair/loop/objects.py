@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
+from amrepair.arrays import Box
 from amrepair.loop.looks import Stop
 from gcode.reader import Job, JobObjects, objects_of
 from gcode.resumption.rest import Rest, without_beads
@@ -46,7 +47,7 @@ class Objects:
         """Those that are still printed."""
         return tuple(name for name in self.found.names if name not in self.given_up)
 
-    def owner(self, box_mm: Float[np.ndarray, "2 3"]) -> str:
+    def owner(self, box_mm: Box) -> str:
         """The object that a box lies in, seen from above; empty where that is in doubt."""
         if len(self.found.names) < 2:
             return ""

@@ -8,9 +8,9 @@ closed loops alone; a void of sparse infill has a line of it, which is open, at 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from amrepair.arrays import ColumnMask, Mask, PlanePoints
 from gcode.reader import Beads
 from gcode.surfaces.lines import columns_around, near_lines
 
@@ -20,7 +20,7 @@ CLOSED_MM = 0.8  # a loop ends so near to where it began: slicers leave a gap at
 _BESIDE = np.ones((3, 3), bool)
 
 
-def outermost(beads: Beads, ours: Bool[np.ndarray, " n"], half_mm: float) -> Bool[np.ndarray, " n"]:
+def outermost(beads: Beads, ours: Mask, half_mm: float) -> Mask:
     """Which of a job's beads bound the part, of up to `OUTLINE_LAYERS` of its layers.
 
     Parameters
@@ -43,7 +43,7 @@ def outermost(beads: Beads, ours: Bool[np.ndarray, " n"], half_mm: float) -> Boo
     return found
 
 
-def _closed(beads: Beads) -> Bool[np.ndarray, " n"]:
+def _closed(beads: Beads) -> Mask:
     """Whether each bead belongs to a path without a travel in it that ends where it began."""
     breaks = (np.linalg.norm(beads.start_mm[1:] - beads.end_mm[:-1], axis=1) > 1e-3) | (
         beads.layer[1:] != beads.layer[:-1]
@@ -54,16 +54,11 @@ def _closed(beads: Beads) -> Bool[np.ndarray, " n"]:
     return np.repeat((apart_mm < CLOSED_MM) & (last > first + 1), last - first + 1)
 
 
-def _at_the_edge(
-    start_mm: Float[np.ndarray, "n 2"],
-    end_mm: Float[np.ndarray, "n 2"],
-    closed: Bool[np.ndarray, " n"],
-    half_mm: float,
-) -> Bool[np.ndarray, " n"]:
+def _at_the_edge(start_mm: PlanePoints, end_mm: PlanePoints, closed: Mask, half_mm: float) -> Mask:
     cell = OUTLINE_CELL_MM
     low, shape = columns_around(start_mm, end_mm, 2.0, cell)
 
-    def covered(pick: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "ny nx"]:
+    def covered(pick: Mask) -> ColumnMask:
         return near_lines(
             start_mm[pick], end_mm[pick], half_mm + 0.5 * cell,
             low_mm=low, cell_mm=cell, shape=shape,

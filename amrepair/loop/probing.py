@@ -15,6 +15,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Points, Values
 from amrepair.frames import Transform
 from amrepair.loop import travel
 from amrepair.loop.looks import Stop
@@ -277,7 +278,7 @@ class ProbeScanner:
         one, other = (last if s.layer_index is None else s.layer_index for s in (earlier, now))
         return abs(other - one)
 
-    def _planned(self, felt_mm: Float[np.ndarray, "n 3"], flats: Flats) -> Float[np.ndarray, " n"]:
+    def _planned(self, felt_mm: Points, flats: Flats) -> Values:
         return np.asarray(flats.top_mm[flats.at(felt_mm[:, :2])])
 
     def _feel(

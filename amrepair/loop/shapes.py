@@ -6,6 +6,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Box, PlanePoints, Points
 from gcode.reader import Job
 from gcode.stretches import in_turn, places_along
 
@@ -58,7 +59,7 @@ def spread(
     return long_mm, max(wide_mm, 1e-6), along
 
 
-def _dense(ring: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+def _dense(ring: PlanePoints) -> Float[np.ndarray, "m 2"]:
     """A ring's outline in even steps: corners alone would weigh fringes."""
     ends = np.roll(ring, -1, axis=0)
     length = np.linalg.norm(ends - ring, axis=1)
@@ -67,9 +68,7 @@ def _dense(ring: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     return np.asarray(ring[owner] + (ends - ring)[owner] * (step / count[owner])[:, None])
 
 
-def bead_way(
-    job: Job, line: int, box_mm: Float[np.ndarray, "2 3"]
-) -> Float[np.ndarray, " 2"] | None:
+def bead_way(job: Job, line: int, box_mm: Box) -> Float[np.ndarray, " 2"] | None:
     """The direction of most of the last layer's beads over a box."""
     beads = job.beads
     done = beads.line < line
@@ -89,7 +88,7 @@ def bead_way(
     return np.array([np.cos(mean), np.sin(mean)])
 
 
-def last_beads(job: Job, line: int) -> Float[np.ndarray, "n 3"]:
+def last_beads(job: Job, line: int) -> Points:
     """Places along the beads of the last layer before a line, as printed."""
     beads = job.beads
     done = beads.line < line

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool
 
+from amrepair.arrays import Mask
 from amrepair.frames import Transform
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
@@ -116,7 +116,7 @@ def sites(
     return Expected(template, build_from_template, setup, by_beads, detector, at)
 
 
-def _laid(job: Job, which: Bool[np.ndarray, " n"], kept: KeptFills) -> LaidBeads | None:
+def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:
     """Some of a job's beads, by layer, without what it lays beside the part."""
     beads = job.beads
     pick = which & ~of_roles(beads, BESIDE_THE_PART)
@@ -132,7 +132,7 @@ def _laid(job: Job, which: Bool[np.ndarray, " n"], kept: KeptFills) -> LaidBeads
     )
 
 
-def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:
+def _beside(job: Job, which: Mask) -> HeightField | None:
     """How high skirts, brims, supports and towers stand, build frame; None where there are none."""
     beads = job.beads
     pick = which & of_roles(beads, BESIDE_THE_PART)
@@ -141,7 +141,7 @@ def _beside(job: Job, which: Bool[np.ndarray, " n"]) -> HeightField | None:
     return _as_high_as(job, pick, STRINGS_MM)
 
 
-def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> HeightField:
+def _as_high_as(job: Job, pick: Mask, wider_mm: float) -> HeightField:
     """How high some of a job's beads stand, build frame; −inf farther than that beside them."""
     beads = job.beads
     start, end = beads.start_mm[pick], beads.end_mm[pick]
@@ -154,7 +154,7 @@ def _as_high_as(job: Job, pick: Bool[np.ndarray, " n"], wider_mm: float) -> Heig
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
 
 
-def lines_of_job(job: Job, which: Bool[np.ndarray, " n"], setup: PrintSetup) -> JobLines:
+def lines_of_job(job: Job, which: Mask, setup: PrintSetup) -> JobLines:
     """Some of a job's beads as lines that a patch may follow, and what they bridge."""
     beads = job.beads
     start, end, section = (

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import ColumnMask, HeightMap, Mask, PlanePoints, Values
 from amrepair.errors import ScannerError
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
@@ -108,9 +109,9 @@ class Flats:
     """
 
     origin_mm: Float[np.ndarray, " 2"]
-    top_mm: Float[np.ndarray, "ny nx"]
-    worth_mm: Float[np.ndarray, "ny nx"]
-    may: Bool[np.ndarray, "ny nx"]
+    top_mm: HeightMap
+    worth_mm: HeightMap
+    may: ColumnMask
     options: ProbeOptions = USUAL_TOUCHES
 
     def xy_mm(self, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "k 2"]:
@@ -224,9 +225,9 @@ def _nearest(places_mm: Float[np.ndarray, "k 2"], to_mm: Float[np.ndarray, " 2"]
 
 def next_places(
     flats: Flats,
-    touched_mm: Float[np.ndarray, "n 2"],
-    off_mm: Float[np.ndarray, " n"],
-    is_off: Bool[np.ndarray, " n"],
+    touched_mm: PlanePoints,
+    off_mm: Values,
+    is_off: Mask,
     *,
     reach_mm: float,
     most: int,
@@ -275,7 +276,7 @@ def _clear(flats: Flats, setup: PrintSetup, standing: HeightField) -> Bool[np.nd
     return clear
 
 
-def _density(laid: Bool[np.ndarray, "ny nx"], options: ProbeOptions) -> Float[np.ndarray, "ny nx"]:
+def _density(laid: ColumnMask, options: ProbeOptions) -> HeightMap:
     """(ny, nx) how much of the area around is laid, of what lies within the layer's outline."""
     wide = 2 * round(options.around_mm / options.cell_mm) + 1
     within = ndimage.minimum_filter(ndimage.maximum_filter(laid, wide), wide) | laid

@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from amrepair.arrays import Mask, Points, Values
 from amrepair.loop.touch_design import USUAL_TOUCHES, Flats, ProbeOptions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import PROBE, Scan
@@ -38,18 +39,18 @@ class Touches:
         By which one is told to be off.
     """
 
-    place_mm: Float[np.ndarray, "n 3"]
-    planned_mm: Float[np.ndarray, " n"]
+    place_mm: Points
+    planned_mm: Values
     sigma_mm: float
     options: ProbeOptions = USUAL_TOUCHES
 
     @property
-    def off_mm(self) -> Float[np.ndarray, " n"]:
+    def off_mm(self) -> Values:
         """(n,) higher than planned; negative: lower."""
         return np.asarray(self.place_mm[:, 2] - self.planned_mm)
 
     @property
-    def is_off(self) -> Bool[np.ndarray, " n"]:
+    def is_off(self) -> Mask:
         """(n,) whether a touch is beyond what a region goes on to, and beyond noise."""
         region = RegionOptions()
         allowed_mm = region.top_allowance_mm + region.registration_sigma_mm

@@ -8,10 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
+from amrepair.arrays import Mask, Numbers, Points, Values, Vector
 from amrepair.field.near import spacing_in
 from amrepair.frames import cells_of, spread_directions
 from amrepair.merge import fuse_kernels as kernels
@@ -31,10 +32,10 @@ class SortedPoints:
         (cells + 1,) first point of each cell, numbered x-major.
     """
 
-    low_mm: Float[np.ndarray, " 3"]
+    low_mm: Vector
     cell_mm: float
     shape: Int[np.ndarray, " 3"]
-    order: Int[np.ndarray, " n"]
+    order: Numbers
     start: Int[np.ndarray, " cells1"]
 
     @property
@@ -43,7 +44,7 @@ class SortedPoints:
         return kernels.PointGrid(self.low_mm, self.cell_mm, self.shape, self.start)
 
     @classmethod
-    def of(cls, points_mm: Float[np.ndarray, "n 3"], cell_mm: float) -> SortedPoints:
+    def of(cls, points_mm: Points, cell_mm: float) -> SortedPoints:
         """Sort points; two empty layers of cells lie around them."""
         low = points_mm.min(axis=0) - 2.0 * cell_mm
         shape = np.floor((points_mm.max(axis=0) - low) / cell_mm).astype(np.int64) + 3
@@ -54,7 +55,7 @@ class SortedPoints:
         return cls(low, cell_mm, shape, order, start)
 
 
-def spacing_of(points_mm: Float[np.ndarray, "n 3"]) -> float:
+def spacing_of(points_mm: Points) -> float:
     """Mean distance of neighbouring points on the surface (`near.spacing_in`)."""
     return spacing_in(cKDTree(points_mm))
 
@@ -75,10 +76,10 @@ class Planes:
         (n,) standard error of the normal, by what the neighbours lie off the plane.
     """
 
-    normals: Float[np.ndarray, "n 3"]
+    normals: Points
     sigma_mm: float
-    rough_mm: Float[np.ndarray, " n"]
-    tilt_rad: Float[np.ndarray, " n"]
+    rough_mm: Values
+    tilt_rad: Values
 
     def or_better(self, other: Planes) -> Planes:
         """At each point the plane of the two that is tilted less; the noise is this one's."""
@@ -91,7 +92,7 @@ class Planes:
         )
 
 
-def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
+def planes(points_mm: Points, spacing_mm: float) -> Planes:
     """Fit a plane at each point, over as much of the surface as tilts it least.
 
     More points average more noise, and reach over edges and through thin walls. On flat ground the
@@ -114,9 +115,7 @@ def planes(points_mm: Float[np.ndarray, "n 3"], spacing_mm: float) -> Planes:
     return found
 
 
-def _planes(
-    points_mm: Float[np.ndarray, "n 3"], radius_mm: float, sigma_mm: float | None
-) -> Planes:
+def _planes(points_mm: Points, radius_mm: float, sigma_mm: float | None) -> Planes:
     cells = SortedPoints.of(points_mm, radius_mm)
     ordered = np.ascontiguousarray(points_mm[cells.order])
     found, least, count = kernels.local_planes(ordered, cells.grid, radius_mm)
@@ -138,12 +137,12 @@ def _planes(
 
 
 def outward(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    points_mm: Points,
+    normals: Points,
     spacing_mm: float,
     sigma_mm: float,
     asked: Int[np.ndarray, " a"] | None = None,
-) -> Float[np.ndarray, "n 3"]:
+) -> Points:
     """(n, 3) the normals, turned to the side from which more of the distance is in sight.
 
     A closed surface lets no ray out from within; one with gaps fewer than from without. What hides
@@ -169,12 +168,8 @@ def outward(
 
 
 def outward_by(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    known: Bool[np.ndarray, " n"],
-    spacing_mm: float,
-    sigma_mm: float,
-) -> Float[np.ndarray, "n 3"]:
+    points_mm: Points, normals: Points, known: Mask, spacing_mm: float, sigma_mm: float
+) -> Points:
     """(n, 3) the normals, those that are not known turned as the known ones beside them are.
 
     Only where no known one lies beside them on their sheet do places look around themselves.
@@ -191,14 +186,14 @@ def outward_by(
 
 
 def _told_by(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    points_mm: Points,
+    normals: Points,
     look_mm: Float[np.ndarray, "s 3"],
     facing: Float[np.ndarray, "s 3"],
     spacing_mm: float,
     sigma_mm: float,
     within_mm: float = np.inf,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Values, Values]:
     """(n,) what the places beside each say for its normal, or against it; (n,) how many say it.
 
     Those on its own sheet: at its height, by the mean of both planes.
@@ -224,8 +219,8 @@ def _told_by(
 def _seen_from(
     look_mm: Float[np.ndarray, "s 3"],
     facing: Float[np.ndarray, "s 3"],
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    points_mm: Points,
+    normals: Points,
     spacing_mm: float,
     sigma_mm: float,
 ) -> Float[np.ndarray, "s 3"]:

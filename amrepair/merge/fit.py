@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 import amrepair
+from amrepair.arrays import Mask, Matrix, Points, Values
 from amrepair.errors import InputError
 from amrepair.frames import diagonal
 from amrepair.merge.cloud import outward_by, planes, spacing_of
@@ -48,7 +48,7 @@ class ScanFit:
 
     template: GridSdf
     fused: Fused
-    poses: tuple[Float[np.ndarray, "4 4"] | None, ...]
+    poses: tuple[Matrix | None, ...]
     sigma_mm: float
     rmse_mm: float
     left_out: Mapping[int, str]
@@ -77,7 +77,7 @@ class ScanFit:
 def fit_from_scans(
     scans: Sequence[Scan],
     *,
-    poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
+    poses: Mapping[str, Matrix] | None = None,
     turntable_deg: float | None = None,
     options: MergeOptions = USUAL_MERGE,
     seed: int = 0,
@@ -204,13 +204,13 @@ def _joined(views: Sequence[View], placed: Placement) -> Cloud:
 
 
 def _by_all(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    sure: Bool[np.ndarray, " n"],
-    tilt_rad: Float[np.ndarray, " n"],
+    points_mm: Points,
+    normals: Points,
+    sure: Mask,
+    tilt_rad: Values,
     spacing_mm: float,
     sigma_mm: float,
-) -> Float[np.ndarray, "n 3"]:
+) -> Points:
     """Outward normals by what all scans have about a place, where that tells them better.
 
     Together they are denser, and reach less far across thin walls.

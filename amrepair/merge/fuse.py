@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import Mask, Numbers, Points, Values, Vector, VoxelMask, Voxels
 from amrepair.device import open3d
 from amrepair.errors import TemplateError
 from amrepair.frames import cells_of
@@ -52,9 +53,9 @@ class Cloud:
         Of all together, and of the sparsest of them.
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    scan: Int[np.ndarray, " n"]
+    points_mm: Points
+    normals: Points
+    scan: Numbers
     scans: int
     spacing_mm: float
     sigma_mm: float
@@ -151,7 +152,7 @@ def fuse(cloud: Cloud, options: FuseOptions = USUAL_FUSE) -> Fused:
 
 def _outvoted(
     cloud: Cloud,
-    against: Bool[np.ndarray, " n"],
+    against: Mask,
     nodes_mm: Float[np.ndarray, "k 3"],
     overruled: Int[np.ndarray, " k"],
     radius_mm: float,
@@ -183,10 +184,7 @@ def _outvoted(
 
 
 def coverage_of(
-    mesh: trimesh.Trimesh,
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    reach_mm: float,
+    mesh: trimesh.Trimesh, points_mm: Points, normals: Points, reach_mm: float
 ) -> Coverage:
     """Which of the surface was not seen: what a disc on it, of that radius and without points,
     covers (the complement of an alpha shape, Edelsbrunner, Kirkpatrick and Seidel 1983).
@@ -226,9 +224,7 @@ def reach_mm(cloud: Cloud, options: FuseOptions) -> float:
     return float(np.sqrt(count / np.pi)) * cloud.spacing_mm
 
 
-def _contradicted(
-    cloud: Cloud, options: FuseOptions
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+def _contradicted(cloud: Cloud, options: FuseOptions) -> tuple[Mask, Mask]:
     """(n,) points that most other scans contradict; (n,) in cells that hold next to nothing."""
     cell_mm = 2.2 * cloud.spacing_mm * np.sqrt(cloud.scans)
     low = cloud.points_mm.min(axis=0) - 2 * cell_mm
@@ -239,7 +235,7 @@ def _contradicted(
     places, surfel = np.unique(key, return_inverse=True)
     count = np.bincount(surfel)
 
-    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "s 3"]:
+    def mean(values: Points) -> Float[np.ndarray, "s 3"]:
         sums = [np.bincount(surfel, weights=values[:, a]) / count for a in range(3)]
         return np.ascontiguousarray(np.stack(sums, axis=1))
 
@@ -266,10 +262,8 @@ def _contradicted(
 
 
 def _band(
-    points_mm: Float[np.ndarray, "n 3"], edge: float, radius_mm: float
-) -> tuple[
-    Float[np.ndarray, " 3"], Int[np.ndarray, " 3"], Float[np.ndarray, "k 3"], Int[np.ndarray, "k 3"]
-]:
+    points_mm: Points, edge: float, radius_mm: float
+) -> tuple[Vector, Int[np.ndarray, " 3"], Float[np.ndarray, "k 3"], Int[np.ndarray, "k 3"]]:
     """Grid and its nodes near the points."""
     low, high = points_mm.min(axis=0), points_mm.max(axis=0)
     low = low - 4 * edge - radius_mm
@@ -288,11 +282,11 @@ def _band(
 
 
 def _fill(
-    grid: Float[np.ndarray, "x y z"],
-    seen: Bool[np.ndarray, "x y z"],
-    low: Float[np.ndarray, " 3"],
+    grid: Voxels,
+    seen: VoxelMask,
+    low: Vector,
     edge: float,
-    oriented: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]],
+    oriented: tuple[Points, Points],
     options: FuseOptions,
 ) -> None:
     """Give the nodes without support a side: their neighbours', or that of a smooth closure."""
@@ -323,13 +317,7 @@ def _fill(
         _ask(grid, asked, _poisson(*oriented, options), low, edge)
 
 
-def _ask(
-    grid: Float[np.ndarray, "x y z"],
-    asked: Bool[np.ndarray, "x y z"],
-    closing: MeshSdf,
-    low: Float[np.ndarray, " 3"],
-    edge: float,
-) -> None:
+def _ask(grid: Voxels, asked: VoxelMask, closing: MeshSdf, low: Vector, edge: float) -> None:
     """Distances to a surface at some nodes, in place: exact near it, of its side elsewhere.
 
     A block whose middle lies farther off than its half diagonal holds none of the surface.
@@ -348,11 +336,7 @@ def _ask(
     grid[asked] = found
 
 
-def _poisson(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    options: FuseOptions = USUAL_FUSE,
-) -> MeshSdf:
+def _poisson(points_mm: Points, normals: Points, options: FuseOptions = USUAL_FUSE) -> MeshSdf:
     """A closed surface through oriented points."""
     import trimesh
 
@@ -371,10 +355,7 @@ def _poisson(
 
 
 def solid_surface(
-    grid: Float[np.ndarray, "x y z"],
-    low: Float[np.ndarray, " 3"],
-    edge: float,
-    dust_ratio: float = USUAL_FUSE.dust_ratio,
+    grid: Voxels, low: Vector, edge: float, dust_ratio: float = USUAL_FUSE.dust_ratio
 ) -> trimesh.Trimesh:
     """Marching cubes, without dust; a valid solid."""
     import manifold3d as m3
@@ -410,7 +391,7 @@ def _spread(
     excess: Float[np.ndarray, " k"],
     close: Bool[np.ndarray, " k"],
     index: Int[np.ndarray, "k 3"],
-    box: tuple[Float[np.ndarray, " 3"], float, Int[np.ndarray, " 3"]],
+    box: tuple[Vector, float, Int[np.ndarray, " 3"]],
     options: FuseOptions,
 ) -> Tolerance:
     """Variance between scans pooled over coarse cells: chance averages out, disagreement stays."""
@@ -429,7 +410,7 @@ def _spread(
     return Tolerance(low - 0.5 * edge, SPREAD_CELLS * edge, grown)
 
 
-def widened(spread: Tolerance, cloud: Cloud, slack_mm: Float[np.ndarray, " n"]) -> Tolerance:
+def widened(spread: Tolerance, cloud: Cloud, slack_mm: Values) -> Tolerance:
     """The spread between scans with what the scans' own poses leave open.
 
     Where several scans saw the surface, that of the middle one: the mean is theirs.

@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
+from amrepair.arrays import Vector
 from amrepair.eigen_kernels import least_axis
 from amrepair.field.scales_kernels import median
 from gcode.compiled import njit, prange
@@ -27,7 +28,7 @@ RAY_STEP = 0.5  # of a cell
 class PointGrid(NamedTuple):
     """Cells that points are sorted by: corner, edge, how many, and where each one's begin."""
 
-    low: Float[np.ndarray, " 3"]
+    low: Vector
     cell: float
     shape: Int[np.ndarray, " 3"]
     start: Int[np.ndarray, " cells1"]

@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Matrix
 from amrepair.merge.match import (
     FreeSpace,
     apart,
@@ -79,7 +79,7 @@ class Graph:
     )
     _joins: dict[frozenset[int], _Join] = field(default_factory=dict)
 
-    def proposed(self, fixed: Placed, moving: Placed) -> list[Float[np.ndarray, "4 4"]]:
+    def proposed(self, fixed: Placed, moving: Placed) -> list[Matrix]:
         """Poses of one group in the other's frame, those that most pairs speak for first."""
         found: list[tuple[float, np.ndarray]] = []
         for i, j in itertools.product(fixed, moving):

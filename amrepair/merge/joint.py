@@ -22,9 +22,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from amrepair.align.registration import bounded_inverse
+from amrepair.arrays import Mask, Matrix, Points, Values, Vector
 from amrepair.frames import cells_of, diagonal, motion_about, moved
 from amrepair.merge.kept import KeptAnswers
 from amrepair.merge.options import USUAL_MERGE, JointOptions
@@ -50,14 +51,12 @@ class Slack:
     """
 
     covariance: Float[np.ndarray, "6 6"]
-    centre_mm: Float[np.ndarray, " 3"]
+    centre_mm: Vector
     size_mm: float
     sigma_mm: float
-    axis: Float[np.ndarray, " 3"]
+    axis: Vector
 
-    def across(
-        self, points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, " n"]:
+    def across(self, points_mm: Points, normals: Points) -> Values:
         """(n,) standard deviation along the normals, mm; common frame."""
         along = _jacobian(points_mm, normals, self.centre_mm, self.size_mm)
         squares = np.einsum("ni,ij,nj->n", along, self.covariance, along)
@@ -97,10 +96,10 @@ Answers = dict[tuple[int, int], KeptAnswers]
 
 def together(
     views: Sequence[View],
-    poses: Sequence[Float[np.ndarray, "4 4"]],
+    poses: Sequence[Matrix],
     rng: np.random.Generator,
     options: JointOptions = USUAL_MERGE.joint,
-) -> tuple[list[Float[np.ndarray, "4 4"]], float]:
+) -> tuple[list[Matrix], float]:
     """All poses but the first, refined jointly; and the residual's root mean square, mm."""
     found = [np.array(pose) for pose in poses]
     sample = _samples(views, options, rng)
@@ -135,7 +134,7 @@ def together(
 
 def slacks(
     views: Sequence[View],
-    poses: Sequence[Float[np.ndarray, "4 4"]],
+    poses: Sequence[Matrix],
     rng: np.random.Generator,
     options: JointOptions = USUAL_MERGE.joint,
 ) -> list[Slack]:
@@ -176,7 +175,7 @@ def _scale_mm(views: Sequence[View], options: JointOptions) -> float:
     )
 
 
-def _frame(pairs: _Pairs) -> tuple[Float[np.ndarray, " 3"], float]:
+def _frame(pairs: _Pairs) -> tuple[Vector, float]:
     """Where turns are about, and how long a radian is."""
     centre = pairs.points_mm.mean(axis=0)
     return centre, float(np.sqrt(((pairs.points_mm - centre) ** 2).sum(axis=1).mean()))
@@ -185,7 +184,7 @@ def _frame(pairs: _Pairs) -> tuple[Float[np.ndarray, " 3"], float]:
 def _jacobian(
     points_mm: Float[np.ndarray, "q 3"],
     normals: Float[np.ndarray, "q 3"],
-    centre_mm: Float[np.ndarray, " 3"],
+    centre_mm: Vector,
     size_mm: float,
 ) -> Float[np.ndarray, "q 6"]:
     return np.concatenate([np.cross(points_mm - centre_mm, normals) / size_mm, normals], axis=1)
@@ -205,7 +204,7 @@ def _answers(
 
 def _pairs(
     views: Sequence[View],
-    poses: Sequence[Float[np.ndarray, "4 4"]],
+    poses: Sequence[Matrix],
     sample: Sequence[Int[np.ndarray, " _"]],
     answers: Answers,
     options: JointOptions,
@@ -255,7 +254,7 @@ def _equations(
     instrument: Float[np.ndarray, "q 6"],
     weight: Float[np.ndarray, " q"],
     count: int,
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, "n n"], Values]:
     """Normal equations over all scans' motions, six for each."""
     information, push = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     for k, r, which in _by_pair(pairs.of, pairs.other, count):
@@ -338,7 +337,7 @@ def _open(
 ) -> list[Float[np.ndarray, "6 6"]]:
     """Each scan's covariance, with one of them held still."""
     count = len(information) // 6
-    moving: Bool[np.ndarray, " n"] = np.arange(6 * count) // 6 != home
+    moving: Mask = np.arange(6 * count) // 6 != home
     inverse = bounded_inverse(information[np.ix_(moving, moving)], options.free_ratio)
     whole = np.zeros_like(information)
     whole[np.ix_(moving, moving)] = inverse @ scatter[np.ix_(moving, moving)] @ inverse
@@ -347,9 +346,9 @@ def _open(
 
 def _slack(
     view: View,
-    pose: Float[np.ndarray, "4 4"],
+    pose: Matrix,
     covariance: Float[np.ndarray, "6 6"],
-    centre_mm: Float[np.ndarray, " 3"],
+    centre_mm: Vector,
     size_mm: float,
     options: JointOptions,
 ) -> Slack:

@@ -10,8 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.spatial import cKDTree
+
+from amrepair.arrays import Numbers, Points, Values
 
 WIDER = 1.25  # asked so much farther than wanted: what is beyond may move a while, unasked
 
@@ -34,9 +36,9 @@ class KeptAnswers:
 
     tree: cKDTree
     reach_mm: float
-    asked_mm: Float[np.ndarray, "n 3"]
-    index: Int[np.ndarray, " n"]
-    holds_mm: Float[np.ndarray, " n"]
+    asked_mm: Points
+    index: Numbers
+    holds_mm: Values
 
     @classmethod
     def of(cls, tree: cKDTree, reach_mm: float, count: int) -> KeptAnswers:
@@ -45,9 +47,7 @@ class KeptAnswers:
             tree, reach_mm, np.zeros((count, 3)), np.full(count, tree.n), np.full(count, -1.0)
         )
 
-    def nearest(
-        self, places_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    def nearest(self, places_mm: Points) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
         """(k,) numbers of the places with a point in reach, and (k,) those points'."""
         moved_mm = np.sqrt(((places_mm - self.asked_mm) ** 2).sum(axis=1))
         again = np.flatnonzero(moved_mm >= self.holds_mm)

@@ -17,6 +17,7 @@ from scipy import ndimage
 from amrepair.align.coarse import by_features, poses_between
 from amrepair.align.search import spread_rotations
 from amrepair.align.search_kernels import peaks
+from amrepair.arrays import Matrix, Vector
 from amrepair.frames import moved, nearest_rotation, rigid
 from amrepair.merge import search_kernels as kernels
 from amrepair.merge.options import MatchOptions, MergeOptions
@@ -51,7 +52,7 @@ MATCH_ROUNDS = (
 class FreeSpace:
     """A grid about a view: cells to free space, negative where none is known to be free; flat."""
 
-    centre_mm: Float[np.ndarray, " 3"]
+    centre_mm: Vector
     cell_mm: float
     field: Float[np.ndarray, " cells"]
 
@@ -107,7 +108,7 @@ def _fitted(
     views: Sequence[View],
     i: int,
     j: int,
-    guesses: Iterable[Float[np.ndarray, "4 4"]],
+    guesses: Iterable[Matrix],
     first: float,
     size_mm: float,
     options: MergeOptions,
@@ -117,7 +118,7 @@ def _fitted(
     match = options.match
     within = np.geomspace(first, match.last_within, 6) * size_mm
 
-    def roughly(guess: Float[np.ndarray, "4 4"]) -> tuple[float, Float[np.ndarray, "4 4"]]:
+    def roughly(guess: Matrix) -> tuple[float, Matrix]:
         pose = settled(fixed, moving, guess, within, match.rough_points, options.judge)
         some = moving.some(match.rough_points)
         near = fixed.tree.query(moved(moving.points_mm[some], pose))[0]
@@ -135,12 +136,10 @@ def _fitted(
     return distinct(fits, moving, options.same_size * size_mm)
 
 
-def apart(
-    poses: Sequence[Float[np.ndarray, "4 4"]], surface: Surface, apart_mm: float
-) -> list[Float[np.ndarray, "4 4"]]:
+def apart(poses: Sequence[Matrix], surface: Surface, apart_mm: float) -> list[Matrix]:
     """The poses in their order, without those that move the surface to where one before does."""
     places = surface.points_mm[surface.some(APART_POINTS)]
-    kept: list[Float[np.ndarray, "4 4"]] = []
+    kept: list[Matrix] = []
     for pose in poses:
         here = moved(places, pose)
         if all(np.abs(moved(places, other) - here).max() > apart_mm for other in kept):
@@ -162,7 +161,7 @@ def _search(
     other: FreeSpace,
     size_mm: float,
     options: MatchOptions,
-) -> list[Float[np.ndarray, "4 4"]]:
+) -> list[Matrix]:
     """Every rotation, moved out of free space; best first."""
     rng = np.random.default_rng(0)
     cell_mm = space.cell_mm

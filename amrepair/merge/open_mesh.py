@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Faces, Points, Vector, Vertices, Voxels
 from amrepair.errors import TemplateError
 from amrepair.field.groups import group_points
 from amrepair.merge.fuse import solid_surface
@@ -163,11 +164,7 @@ def _closed(
 
 
 def _bounding(
-    shell: Shell,
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    edge: float,
-    options: OpenMeshOptions,
+    shell: Shell, points: Points, normals: Points, edge: float, options: OpenMeshOptions
 ) -> float:
     """Share of the triangles' area that has an inside behind it and an outside before it.
 
@@ -190,7 +187,7 @@ def _no_part(name: str, followed: float, options: OpenMeshOptions) -> str:
     )
 
 
-def _oriented(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def _oriented(mesh: trimesh.Trimesh) -> tuple[Vertices, Faces]:
     """Welded triangles of some area, neighbours wound alike, most of the volume inside."""
     import trimesh
 
@@ -205,9 +202,7 @@ def _oriented(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "v 3"], Int[np.n
     return np.array(vertices), np.array(faces if volume >= 0 else faces[:, ::-1])
 
 
-def _rims(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], edge: float
-) -> Float[np.ndarray, "k 3"]:
+def _rims(vertices: Vertices, faces: Faces, edge: float) -> Float[np.ndarray, "k 3"]:
     """Points along the edges that belong to other than two faces, half a cell apart."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     pairs, count = np.unique(edges, axis=0, return_counts=True)
@@ -219,10 +214,10 @@ def _field(
     tree: TriangleTree,
     shell: Shell,
     rims: Float[np.ndarray, "k 3"],
-    vertices: Float[np.ndarray, "v 3"],
+    vertices: Vertices,
     edge: float,
     progress: Progress,
-) -> tuple[Float[np.ndarray, "x y z"], Float[np.ndarray, " 3"]]:
+) -> tuple[Voxels, Vector]:
     """f at the nodes of a grid, right where it is near 0; and the first node.
 
     Near triangles it is the distance to them, of the side that they face; near open rims and in

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Matrix
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge.groups import Graph, grouped
@@ -44,7 +44,7 @@ def place(
     views: Sequence[View],
     rng: np.random.Generator,
     *,
-    told: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
+    told: Mapping[str, Matrix] | None = None,
     unit_mm: float = 1.0,
     turntable_deg: float | None = None,
     options: MergeOptions = USUAL_MERGE,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from amrepair.align.pose_kernels import step_down
 from amrepair.align.search_kernels import field_at
+from amrepair.arrays import Points
 from gcode.compiled import njit, prange
 
 PAIR_DAMPING = 1e-3
@@ -22,8 +23,8 @@ PULL = 0.5  # of surface that lies behind, beside what lies in free space
 class Pair(NamedTuple):
     """Two views, in cells about their grids' middle: points, normals and field of each."""
 
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
+    points: Points
+    normals: Points
     others: Float[np.ndarray, "m 3"]
     other_normals: Float[np.ndarray, "m 3"]
     field: Float[np.ndarray, " k"]

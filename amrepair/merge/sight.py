@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import Matrix, Numbers, Points, Vector
 from amrepair.frames import diagonal, moved, spread_directions, ways_across
 from amrepair.merge import sight_kernels as kernels
 from amrepair.merge.cloud import outward, planes, spacing_of
@@ -28,9 +29,9 @@ class Veil:
     such a face was not seen through.
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    pose: Float[np.ndarray, "4 4"]
+    points_mm: Points
+    normals: Points
+    pose: Matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +59,10 @@ class DepthImage:
     @classmethod
     def of(
         cls,
-        points_mm: Float[np.ndarray, "n 3"],
-        sensor_mm: Float[np.ndarray, " 3"],
+        points_mm: Points,
+        sensor_mm: Vector,
         *,
-        way: Float[np.ndarray, " 3"] | None = None,
+        way: Vector | None = None,
         guessed: bool = False,
         options: SightOptions = USUAL_MERGE.sight,
     ) -> DepthImage:
@@ -198,9 +199,9 @@ NOWHERE = DepthImages((), False)
 
 
 def told(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     sensors_mm: Float[np.ndarray, "k 3"],
-    sensor_index: Int[np.ndarray, " n"],
+    sensor_index: Numbers,
     options: SightOptions = USUAL_MERGE.sight,
 ) -> DepthImages:
     """Looks of sensors whose places are known; many places on a line are one that moved along."""
@@ -221,7 +222,7 @@ def told(
 
 
 def guess_directions(
-    points_mm: Float[np.ndarray, "n 3"], options: SightOptions = USUAL_MERGE.sight
+    points_mm: Points, options: SightOptions = USUAL_MERGE.sight
 ) -> Float[np.ndarray, "k 3"]:
     """Ways to where one sensor may have stood that saw all of these points; none of a whole scan.
 
@@ -246,9 +247,7 @@ def guess_directions(
 
 
 def guessed(
-    points_mm: Float[np.ndarray, "n 3"],
-    towards: Float[np.ndarray, "k 3"],
-    options: SightOptions = USUAL_MERGE.sight,
+    points_mm: Points, towards: Float[np.ndarray, "k 3"], options: SightOptions = USUAL_MERGE.sight
 ) -> DepthImages:
     """Looks from every place where the sensor may have stood."""
     centre = points_mm.mean(axis=0)
@@ -266,11 +265,7 @@ def guessed(
 
 
 def _hidden(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    way: Float[np.ndarray, " 3"],
-    spacing_mm: float,
-    options: SightOptions,
+    points_mm: Points, normals: Points, way: Vector, spacing_mm: float, options: SightOptions
 ) -> float:
     """Share of the points that another hides along a direction, from either end, or edge-on."""
     axes, _ = axes_towards(way)
@@ -287,7 +282,7 @@ def _hidden(
     return float(behind.mean() + options.grazing_counts * (steep < options.grazing).mean())
 
 
-def _spread(towards: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "k 3"]:
+def _spread(towards: Points, most: int) -> Float[np.ndarray, "k 3"]:
     """As many as may be, each as far from the others as can be; the outermost are among them."""
     if len(towards) <= most:
         return towards
@@ -297,7 +292,7 @@ def _spread(towards: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "
     return towards[chosen]
 
 
-def axes_towards(way: Float[np.ndarray, " 3"]) -> tuple[Float[np.ndarray, "3 3"], float]:
+def axes_towards(way: Vector) -> tuple[Float[np.ndarray, "3 3"], float]:
     """Rows: two directions across, and the way itself; and how long it is."""
     length = float(np.linalg.norm(way))
     along = way / length

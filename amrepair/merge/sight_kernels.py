@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Vector
 from gcode.compiled import njit
 
 
@@ -16,7 +17,7 @@ class Camera(NamedTuple):
     length in pixels, how far off the part is, and whether it is a moving sheet of light.
     """
 
-    sensor: Float[np.ndarray, " 3"]
+    sensor: Vector
     axes: Float[np.ndarray, "3 3"]
     scale: float
     distance: float

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from amrepair.align import align
+from amrepair.arrays import Matrix
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.scans import Scan
@@ -40,7 +40,7 @@ class SoundFit:
 
     template: LearnedSdf
     sound: SoundParts
-    poses: tuple[Float[np.ndarray, "4 4"] | None, ...]
+    poses: tuple[Matrix | None, ...]
     left_out: dict[int, str]
     notes: tuple[str, ...]
 

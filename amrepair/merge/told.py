@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from amrepair.arrays import Matrix
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import moved, nearest_rotation, rigid
 from amrepair.merge.match import featured, searched
@@ -25,7 +25,7 @@ TRIAL_POINTS = 1_000  # of a view, that decide which way round a rotation is wri
 TABLE_TURN_RAD = 0.06  # 3.5°: how far a pair's own turn may be from the table's
 
 
-def read_poses(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
+def read_poses(path: Path) -> dict[str, Matrix]:
     """(4, 4) common frame from view, by the view's file name; translations in the files' unit.
 
     Raises
@@ -58,7 +58,7 @@ def read_poses(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
     return found
 
 
-def _conf(text: str) -> dict[str, Float[np.ndarray, "4 4"]]:
+def _conf(text: str) -> dict[str, Matrix]:
     """`bmesh NAME tx ty tz qx qy qz qw`: the quaternion turns the frame, not the points."""
     found = {}
     for line in text.splitlines():
@@ -69,7 +69,7 @@ def _conf(text: str) -> dict[str, Float[np.ndarray, "4 4"]]:
     return found
 
 
-def _aln(text: str) -> dict[str, Float[np.ndarray, "4 4"]]:
+def _aln(text: str) -> dict[str, Matrix]:
     """A count; then of each view its name, a line `#`, and four rows."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     found = {}
@@ -80,16 +80,14 @@ def _aln(text: str) -> dict[str, Float[np.ndarray, "4 4"]]:
     return found
 
 
-def _json(text: str) -> dict[str, Float[np.ndarray, "4 4"]]:
+def _json(text: str) -> dict[str, Matrix]:
     """`{"NAME": [[…]…]…}`, or the same under `views` or `poses`; rows, or sixteen numbers."""
     told = json.loads(text)
     told = told.get("views", told.get("poses", told))
     return {name: np.array(pose, dtype=float).reshape(4, 4) for name, pose in told.items()}
 
 
-def of_views(
-    told: Mapping[str, Float[np.ndarray, "4 4"]], views: Sequence[View], unit_mm: float
-) -> Placed:
+def of_views(told: Mapping[str, Matrix], views: Sequence[View], unit_mm: float) -> Placed:
     """The poses by the views' numbers, mm; views that the file does not name have none.
 
     Some files write rotations of some views the other way round (the Stanford bunny's do): the way
@@ -151,7 +149,7 @@ def _searched(
     return searched(views, {}, i, j, size_mm, options)
 
 
-def _about(pose: Float[np.ndarray, "4 4"], angle: float, count: int) -> Placed:
+def _about(pose: Matrix, angle: float, count: int) -> Placed:
     """Turns about a pose's axis: the first view's frame from each view."""
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     axis = turn / np.linalg.norm(turn)

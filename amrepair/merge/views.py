@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.align.thinning import thin_out
+from amrepair.arrays import Mask, Matrix, Numbers, Points, Values
 from amrepair.errors import InputError
 from amrepair.frames import diagonal, motion_about, moved
 from amrepair.merge import sight
@@ -28,12 +29,12 @@ STEP_DAMPING = 1e-6  # of the mean curvature of turns, and of shifts
 class Surface:
     """Points with their normals, (n, 3) each, all to the side from which they were seen."""
 
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
+    points_mm: Points
+    normals: Points
     tree: cKDTree
 
     @classmethod
-    def of(cls, points_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Surface:
+    def of(cls, points_mm: Points, normals: Points) -> Surface:
         """With a tree."""
         return cls(points_mm, normals, cKDTree(points_mm))
 
@@ -70,9 +71,9 @@ class View:
 
     name: str
     surface: Surface
-    rough_mm: Float[np.ndarray, " n"]
-    tilt_rad: Float[np.ndarray, " n"]
-    incidence: Float[np.ndarray, " n"]
+    rough_mm: Values
+    tilt_rad: Values
+    incidence: Values
     thin: Surface
     spacing_mm: float
     thin_spacing_mm: float
@@ -125,12 +126,12 @@ class View:
         return diagonal(self.thin.points_mm)
 
     @property
-    def sure(self) -> Bool[np.ndarray, " n"]:
+    def sure(self) -> Mask:
         """(n,) whether it is clear which way the normals face."""
         return np.asarray(self.incidence > self.clear)
 
     @property
-    def confidence(self) -> Float[np.ndarray, " n"]:
+    def confidence(self) -> Values:
         """(n,) inverse variance of what the angle of incidence adds; 1 head-on, or unknown.
 
         Below `clear` the cosine is the normal's noise.
@@ -139,9 +140,9 @@ class View:
 
 
 def _looks(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     sensors_mm: Float[np.ndarray, "k 3"] | None,
-    sensor_index: Int[np.ndarray, " n"] | None,
+    sensor_index: Numbers | None,
     rng: np.random.Generator,
     options: MergeOptions,
 ) -> sight.DepthImages:
@@ -156,14 +157,14 @@ def _looks(
 
 
 def _facing(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    points_mm: Points,
+    normals: Points,
     spacing_mm: float,
     sigma_mm: float,
     sensors_mm: Float[np.ndarray, "k 3"] | None,
-    sensor_index: Int[np.ndarray, " n"] | None,
+    sensor_index: Numbers | None,
     looks: sight.DepthImages,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+) -> tuple[Points, Values]:
     """Normals to the sensor that saw each point, else to where more of the distance is in sight.
 
     And the cosines of the angles of incidence.
@@ -200,7 +201,7 @@ class Fit:
         Sensors' places tell of free space; else overlap alone, and what lies above and below it.
     """
 
-    pose: Float[np.ndarray, "4 4"]
+    pose: Matrix
     overlap: float
     against: float
     beside: float
@@ -238,7 +239,7 @@ class Fit:
         )
 
 
-Placed = dict[int, Float[np.ndarray, "4 4"]]
+Placed = dict[int, Matrix]
 
 
 def joined(views: Sequence[View], poses: Placed, each: int) -> Surface:
@@ -254,11 +255,11 @@ def joined(views: Sequence[View], poses: Placed, each: int) -> Surface:
 def settled(
     fixed: Surface,
     moving: Surface,
-    pose: Float[np.ndarray, "4 4"],
+    pose: Matrix,
     within_mm: Float[np.ndarray, " steps"],
     count: int,
     options: JudgeOptions,
-) -> Float[np.ndarray, "4 4"]:
+) -> Matrix:
     """The pose after some steps point to plane, each with pairs no farther apart than it says."""
     some = moving.some(count)
     found = pose
@@ -287,7 +288,7 @@ def _step(
     normals: Float[np.ndarray, "q 3"],
     height_mm: Float[np.ndarray, " q"],
     scale_mm: float,
-) -> Float[np.ndarray, "4 4"]:
+) -> Matrix:
     """The (4, 4) motion of one Gauss–Newton step that brings points onto planes."""
     weight = loss_weight(height_mm, scale_mm)
     centre = points_mm.mean(axis=0)
@@ -300,11 +301,7 @@ def _step(
 
 
 def judged(
-    views: Sequence[View],
-    fixed: Placed,
-    moving: Placed,
-    pose: Float[np.ndarray, "4 4"],
-    options: MergeOptions,
+    views: Sequence[View], fixed: Placed, moving: Placed, pose: Matrix, options: MergeOptions
 ) -> Fit:
     """How well one group of placed views, in a pose, agrees with what the other saw."""
     there = {k: pose @ own for k, own in moving.items()}
@@ -330,11 +327,7 @@ def judged(
 
 
 def _marks(
-    view: View,
-    other: View,
-    pose: Float[np.ndarray, "4 4"],
-    veil: sight.Veil,
-    options: MergeOptions,
+    view: View, other: View, pose: Matrix, veil: sight.Veil, options: MergeOptions
 ) -> Bool[np.ndarray, "3 k"]:
     """Which of another view's points lie on a view's surface, contradict it, or do by its rim."""
     spacing_mm = max(view.thin_spacing_mm, other.thin_spacing_mm)

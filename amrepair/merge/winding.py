@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from amrepair.align.thinning_kernels import morton_keys
+from amrepair.arrays import Mask, Points, Values
 from amrepair.merge import winding_kernels as kernels
 
 LEAF_MM = 1.5
@@ -35,9 +36,9 @@ class Shell:
         (n, 3) outward normals times area.
     """
 
-    place_mm: Float[np.ndarray, "n 3"]
-    vector_mm2: Float[np.ndarray, "n 3"]
-    _soft2: Float[np.ndarray, " n"]
+    place_mm: Points
+    vector_mm2: Points
+    _soft2: Values
     _child: Int[np.ndarray, "k 2"]
     _centre: Float[np.ndarray, "k 3"]
     _total: Float[np.ndarray, "k 3"]
@@ -46,7 +47,7 @@ class Shell:
     _root: tuple[int, int]
 
     @classmethod
-    def of(cls, place_mm: Float[np.ndarray, "n 3"], vector_mm2: Float[np.ndarray, "n 3"]) -> Shell:
+    def of(cls, place_mm: Points, vector_mm2: Points) -> Shell:
         """Build the tree over patches."""
         area = np.linalg.norm(vector_mm2, axis=1)
         low = place_mm.min(axis=0) if len(place_mm) else np.zeros(3)
@@ -56,7 +57,7 @@ class Shell:
         place, vector = place_mm[order], np.ascontiguousarray(vector_mm2[order])
         weight = np.maximum(area[order], 1e-12)
         child, centre, total, radius = [], [], [], []
-        leaf: list[Bool[np.ndarray, " n"]] = []
+        leaf: list[Mask] = []
         below_place, below_weight = place, weight
         below_vector, below_radius = vector, np.zeros(len(place))
         below_start = 0

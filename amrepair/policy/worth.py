@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from amrepair.arrays import Box, Mask, Values
 from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 from amrepair.regions import Label, Region
 
 
 def defect_volumes(
-    boxes_mm: Sequence[Float[np.ndarray, "2 3"]],
+    boxes_mm: Sequence[Box],
     volumes_mm3: Sequence[float],
     skipped: Sequence[bool],
     options: PolicyOptions = USUAL_POLICY,
-) -> Float[np.ndarray, " n"]:
+) -> Values:
     """Volume of the defect that each piece belongs to.
 
     Skipped beads that cross leave several pieces side by side: one defect. Those that rays went
@@ -53,11 +53,11 @@ def defect_volumes(
 
 
 def worth_mending(
-    boxes_mm: Sequence[Float[np.ndarray, "2 3"]],
+    boxes_mm: Sequence[Box],
     volumes_mm3: Sequence[float],
     skipped: Sequence[bool],
     options: PolicyOptions = USUAL_POLICY,
-) -> Bool[np.ndarray, " n"]:
+) -> Mask:
     """(n,) pieces of a defect that is worth a repair; see `defect_volumes`."""
     least_mm3 = np.where(
         np.asarray(skipped, dtype=bool), options.least_skipped_mm3, options.least_mm3

@@ -12,8 +12,9 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from amrepair.arrays import Mask
 from amrepair.loop import Action, Look, LoopReport
 from amrepair.loop.afterwards import Afterwards
 from amrepair.loop.buried import buried_mm3, pieces_of
@@ -289,7 +290,7 @@ def look_of(
     )
 
 
-def of_the_part(plan: RepairPlan) -> Bool[np.ndarray, " n"]:
+def of_the_part(plan: RepairPlan) -> Mask:
     """(n,) points of the scan that show the part: detection's own word on bed, skirt and strays.
 
     The bed beside the part lies outside of it, and is no excess; nor are reflections in mid-air.

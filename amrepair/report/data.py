@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from amrepair.arrays import Box, Faces, Numbers, Points, Values, Vertices
 from gcode.moves import Extrude, LayerChange, Role, Toolpath
 from gcode.surfaces import HeightField
 
@@ -41,8 +42,8 @@ class SolidMesh:
         (f, 3) vertex indices, counter-clockwise from outside.
     """
 
-    vertices_mm: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices_mm: Vertices
+    faces: Faces
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +85,12 @@ class BeadPath:
         Names of the roles that occur.
     """
 
-    start_mm: Float[np.ndarray, "n 3"]
-    end_mm: Float[np.ndarray, "n 3"]
-    width_mm: Float[np.ndarray, " n"]
-    height_mm: Float[np.ndarray, " n"]
-    layer: Int[np.ndarray, " n"]
-    role: Int[np.ndarray, " n"]
+    start_mm: Points
+    end_mm: Points
+    width_mm: Values
+    height_mm: Values
+    layer: Numbers
+    role: Numbers
     layer_top_mm: Float[np.ndarray, " k"]
     roles: tuple[str, ...]
 
@@ -157,7 +158,7 @@ class RegionRow:
 
     type: str
     volume_mm3: float
-    box_mm: Float[np.ndarray, "2 3"]
+    box_mm: Box
     reachable_ratio: float | None = None
     note: str = ""
 
@@ -215,9 +216,9 @@ class TemperatureSeries:
     """
 
     name: str
-    time_s: Float[np.ndarray, " n"]
-    measured_c: Float[np.ndarray, " n"]
-    target_c: Float[np.ndarray, " n"] | None = None
+    time_s: Values
+    measured_c: Values
+    target_c: Values | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,12 +264,12 @@ class ReportLook:
     """
 
     label: str
-    points_mm: Float[np.ndarray, "n 3"]
-    deviation_mm: Float[np.ndarray, " n"]
-    label_of_point: Int[np.ndarray, " n"]
+    points_mm: Points
+    deviation_mm: Values
+    label_of_point: Numbers
     threshold_mm: float
     threshold_source: str = ""
-    normals: Float[np.ndarray, "n 3"] | None = None
+    normals: Points | None = None
     unseen_mm: Float[np.ndarray, "u 3"] | None = None
     missing: SolidMesh | None = None
     excess: SolidMesh | None = None

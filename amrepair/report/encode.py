@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.spatial import cKDTree
 
 from amrepair.align.thinning_kernels import morton_keys
+from amrepair.arrays import Numbers, Points
 from amrepair.report.data import SolidMesh
 from amrepair.report.options import USUAL_PAGE
 from amrepair.template.surface import triangle_areas_normals
@@ -55,9 +56,7 @@ def integers(values: np.ndarray) -> Encoded:
     return _packed(array.astype(kind))
 
 
-def thinned(
-    points_mm: Float[np.ndarray, "n 3"], important: np.ndarray, *, budget: int
-) -> Int[np.ndarray, " k"]:
+def thinned(points_mm: Points, important: np.ndarray, *, budget: int) -> Int[np.ndarray, " k"]:
     """Indices of at most `budget` points: the important ones first, the rest evenly in space.
 
     Points are put in Morton order and every so-manieth is taken, which keeps the cloud's own
@@ -76,11 +75,7 @@ def thinned(
     return np.sort(chosen)
 
 
-def shading(
-    points_mm: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"] | None,
-    side: tuple[int, int] = (-1, -1),
-) -> Int[np.ndarray, " n"]:
+def shading(points_mm: Points, normals: Points | None, side: tuple[int, int] = (-1, -1)) -> Numbers:
     """(n,) brightness 0..15 of each point under a fixed light, so that a cloud shows its form.
 
     Parameters

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from amrepair.arrays import Faces
 from amrepair.report.data import LeftPart, SolidMesh
 from amrepair.report.options import USUAL_PAGE
 from gcode.slicing.patch import LeftCause, LeftColumns
@@ -61,7 +62,5 @@ def _joined(
 
 def _boxes(low_mm: Float[np.ndarray, "b 3"], high_mm: Float[np.ndarray, "b 3"]) -> SolidMesh:
     vertices = low_mm[:, None] + CORNERS * (high_mm - low_mm)[:, None]
-    faces: Int[np.ndarray, "f 3"] = (FACES + 8 * np.arange(len(low_mm))[:, None, None]).reshape(
-        -1, 3
-    )
+    faces: Faces = (FACES + 8 * np.arange(len(low_mm))[:, None, None]).reshape(-1, 3)
     return SolidMesh(vertices.reshape(-1, 3), faces)

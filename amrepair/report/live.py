@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Points, Values, Vertices
 from amrepair.loop import Decision, Look
 from amrepair.repair import RepairPlan
 from amrepair.report import guarded
@@ -33,7 +33,7 @@ MISSING_RGB, EXCESS_RGB, BEADS = (10, 98, 180), (207, 82, 0), (18, 144, 111)
 PART_RGB, JOB_RGB = (125, 139, 152), (176, 186, 194)
 
 
-def deviation_colours(deviation_mm: Float[np.ndarray, " n"], range_mm: float) -> np.ndarray:
+def deviation_colours(deviation_mm: Values, range_mm: float) -> np.ndarray:
     """(n, 3) 0…255 colours of signed deviations, −range…range."""
     at = (
         (np.clip(deviation_mm / max(range_mm, 1e-9), -1.0, 1.0) + 1.0) / 2 * (len(COLOUR_STOPS) - 1)
@@ -150,7 +150,7 @@ class LiveView:
     def show_mesh(
         self,
         name: str,
-        vertices_mm: Float[np.ndarray, "v 3"],
+        vertices_mm: Vertices,
         faces: np.ndarray,
         colour: tuple[int, int, int],
         *,
@@ -172,8 +172,8 @@ class LiveView:
     def show_cloud(
         self,
         name: str,
-        points_mm: Float[np.ndarray, "n 3"],
-        deviation_mm: Float[np.ndarray, " n"] | None = None,
+        points_mm: Points,
+        deviation_mm: Values | None = None,
         *,
         range_mm: float = 1.0,
     ) -> None:
@@ -193,11 +193,7 @@ class LiveView:
         self._switch(name, handle)
 
     def show_segments(
-        self,
-        name: str,
-        start_mm: Float[np.ndarray, "n 3"],
-        end_mm: Float[np.ndarray, "n 3"],
-        colour: tuple[int, int, int],
+        self, name: str, start_mm: Points, end_mm: Points, colour: tuple[int, int, int]
     ) -> Any:
         """Draw beads as lines."""
         if not len(start_mm):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Numbers
 from amrepair.errors import InputError
 from amrepair.scans.range_grid import NO_POINT, RangeGrid
 from amrepair.scans.range_grid_kernels import lists_of_bytes, lists_of_numbers
@@ -63,9 +64,7 @@ def read_grid(rest: memoryview, header: PlyHeader, path: Path) -> RangeGrid | No
     return RangeGrid(entries.astype(np.int32).reshape(rows, columns))
 
 
-def _grid_entries(
-    rest: memoryview, order: str, kind: PlyList, count: int, path: Path
-) -> Int[np.ndarray, " n"]:
+def _grid_entries(rest: memoryview, order: str, kind: PlyList, count: int, path: Path) -> Numbers:
     """One number a pixel: its vertex, or -1 for a gap; others are errors."""
     if order == "":
         try:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Matrix, Points, Vector
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans.range_grid import RangeGrid
@@ -32,8 +32,8 @@ PIXEL_BYTES = 6  # "0 0 0" and the end of its line
 class _Station:
     """One scan of a file: its seen points and its place, in the file's frame."""
 
-    points_mm: Float[np.ndarray, "n 3"]
-    sensor_mm: Float[np.ndarray, " 3"]
+    points_mm: Points
+    sensor_mm: Vector
     grid: RangeGrid
 
 
@@ -94,9 +94,7 @@ def _station(
     return _Station(points_mm, sensor_mm, RangeGrid.of_seen(seen, "perspective", first=first))
 
 
-def _header(
-    head: bytes, lines: Iterator[bytes], path: Path
-) -> tuple[int, int, Float[np.ndarray, " 3"], Float[np.ndarray, "4 4"]]:
+def _header(head: bytes, lines: Iterator[bytes], path: Path) -> tuple[int, int, Vector, Matrix]:
     """Columns, rows, the scanner's place and the matrix that acts on column vectors, metres."""
     try:
         said = [head, *(next(lines) for _ in range(HEADER_LINES - 1))]
@@ -113,7 +111,7 @@ def _header(
     return columns, rows, place, matrix
 
 
-def _rigid(matrix: Float[np.ndarray, "4 4"], path: Path) -> Transform:
+def _rigid(matrix: Matrix, path: Path) -> Transform:
     """The matrix as a motion in millimetres."""
     in_mm = matrix.copy()
     in_mm[:3, 3] *= MM_PER_M

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32, UInt8
 
+from amrepair.arrays import Box, Numbers, Points, Values
 from amrepair.errors import InputError
 from amrepair.scans import range_grid_kernels as kernels
 
@@ -102,16 +103,16 @@ class GridDepths:
         What the next row's is of that.
     """
 
-    depth: Float[np.ndarray, " n"]
-    spacing: Float[np.ndarray, " n"]
+    depth: Values
+    spacing: Values
     row_ratio: float
 
 
 def edge_flags(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     grids: tuple[RangeGrid, ...],
     sensors_mm: Float[np.ndarray, "k 3"] | None = None,
-    sensor_index: Int[np.ndarray, " n"] | None = None,
+    sensor_index: Numbers | None = None,
     options: EdgeOptions | None = None,
 ) -> UInt8[np.ndarray, " n"]:
     """Which points lie at an edge, and which of them fly.
@@ -146,10 +147,10 @@ def edge_flags(
 
 
 def depths_of(
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     grid: RangeGrid,
     sensors_mm: Float[np.ndarray, "k 3"] | None = None,
-    sensor_index: Int[np.ndarray, " n"] | None = None,
+    sensor_index: Numbers | None = None,
 ) -> GridDepths | None:
     """Depths and spacings; None where the grid has no two neighbours to measure a spacing."""
     steps = mean_steps(points_mm, grid)
@@ -172,9 +173,7 @@ def depths_of(
     return GridDepths(depth, depth * across[0], across[1] / across[0])
 
 
-def mean_steps(
-    points_mm: Float[np.ndarray, "n 3"], grid: RangeGrid
-) -> Float[np.ndarray, "2 3"] | None:
+def mean_steps(points_mm: Points, grid: RangeGrid) -> Box | None:
     """How the points go on by a column and by a row, on average; None for fewer than three."""
     rows, columns = np.nonzero(grid.index >= 0)
     if len(rows) < 3:
@@ -199,9 +198,7 @@ def _neighbours(
 
 
 def _median_turn(
-    rays: Float[np.ndarray, "n 3"],
-    first: Int[np.ndarray, " m"],
-    second: Int[np.ndarray, " m"],
+    rays: Points, first: Int[np.ndarray, " m"], second: Int[np.ndarray, " m"]
 ) -> float:
     """Median angle between pairs of rays, rad; 0 without pairs."""
     if len(first) == 0:

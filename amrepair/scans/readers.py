@@ -13,8 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import InputError, refused_as_ours
 from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
 from amrepair.scans.depth_map import read_depth_map
@@ -177,7 +178,7 @@ def _with_edges(scan: Scan) -> Scan:
 
 
 def _from_columns(
-    columns: dict[str, Float[np.ndarray, " n"]],
+    columns: dict[str, Values],
     path: Path,
     frame: str,
     *,
@@ -196,7 +197,7 @@ def _from_columns(
         # A cloud without normals may carry zeros or NaN in their place.
         if len(raw) and np.isfinite(length).all() and (length > 1e-6).mean() > 0.99:
             normals = raw / np.maximum(length, 1e-12)
-    index: Int[np.ndarray, " n"] | None = None
+    index: Numbers | None = None
     if sensors_mm is not None:
         column = np.nan_to_num(columns.get("sensor", np.zeros(len(points))))
         index = np.clip(column, 0, len(sensors_mm) - 1).astype(np.int64)
@@ -251,7 +252,7 @@ def _read_pcd(path: Path, frame: str, unit_mm: float) -> Scan:
 
 
 def _without_gaps(
-    columns: dict[str, Float[np.ndarray, " n"]], grid: RangeGrid
+    columns: dict[str, Values], grid: RangeGrid
 ) -> tuple[dict[str, Float[np.ndarray, " m"]], RangeGrid]:
     """Points of a range image that are NaN are gaps.
 
@@ -271,7 +272,7 @@ def _without_gaps(
 
 
 def _viewpoint(
-    columns: dict[str, Float[np.ndarray, " n"]], grid: RangeGrid | None, header: PcdHeader
+    columns: dict[str, Values], grid: RangeGrid | None, header: PcdHeader
 ) -> tuple[Float[np.ndarray, "1 3"] | None, bool]:
     """Where a PCD file's VIEWPOINT puts the sensor, and whether rays meet there.
 
@@ -306,7 +307,7 @@ def _read_table(path: Path, frame: str, unit_mm: float) -> Scan:
     return _from_columns(columns, path, frame, unit_mm=unit_mm)
 
 
-def _are_unit(vectors: Float[np.ndarray, "n 3"]) -> bool:
+def _are_unit(vectors: Points) -> bool:
     """Whether nearly all are of length 1, as files round it."""
     length = np.linalg.norm(vectors, axis=1)
     return bool((np.abs(length - 1.0) < UNIT_LENGTH_WITHIN).mean() > UNIT_LENGTH_SHARE)

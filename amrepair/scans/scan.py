@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from amrepair.arrays import Mask, Numbers, Points
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans.range_grid import RangeGrid
@@ -57,12 +58,12 @@ class Scan:
     20
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
+    points_mm: Points
     sigma_mm: float
     frame: str
-    normals: Float[np.ndarray, "n 3"] | None = None
+    normals: Points | None = None
     sensors_mm: Float[np.ndarray, "k 3"] | None = None
-    sensor_index: Int[np.ndarray, " n"] | None = None
+    sensor_index: Numbers | None = None
     source: str = "memory"
     grids: tuple[RangeGrid, ...] | None = None
     edge: UInt8[np.ndarray, " n"] | None = None
@@ -111,7 +112,7 @@ class Scan:
         return len(self.points_mm)
 
     @property
-    def view_index(self) -> Int[np.ndarray, " n"] | None:
+    def view_index(self) -> Numbers | None:
         """(n,) which view saw each point; None where nobody knows, or all are of one.
 
         A grid is a view, however many places its sensor passed; else a sensor is.
@@ -143,7 +144,7 @@ class Scan:
             frame=target_from_source.target,
         )
 
-    def subset(self, keep: Bool[np.ndarray, " n"] | Int[np.ndarray, " k"]) -> Scan:
+    def subset(self, keep: Mask | Int[np.ndarray, " k"]) -> Scan:
         """Some of the points, by a mask or by their numbers, with all that is said of each.
 
         The grids are dropped: their gaps would no longer be gaps. The edge flags stay true.

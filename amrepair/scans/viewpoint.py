@@ -23,6 +23,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Points, Vector
 from amrepair.frames import diagonal
 from amrepair.scans import range_grid_kernels as kernels
 from amrepair.scans.range_grid import EdgeOptions, Kind, RangeGrid, depths_of
@@ -126,7 +127,7 @@ class _Slits:
     image_along: int
     sheets: _Pencil
     across: _Pencil
-    middle: Float[np.ndarray, " 3"]
+    middle: Vector
     scale: float
 
     def sensors(self, pixel: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
@@ -149,9 +150,7 @@ class _Fit:
 
 
 def viewpoint_of(
-    points_mm: Float[np.ndarray, "n 3"],
-    grid: RangeGrid,
-    options: ViewpointOptions | None = None,
+    points_mm: Points, grid: RangeGrid, options: ViewpointOptions | None = None
 ) -> Viewpoint | None:
     """The sensor of a grid, by the model of its rays that fits.
 
@@ -190,7 +189,7 @@ def viewpoint_of(
     return _along_the_way(points, grid, points_mm, best.slits)
 
 
-def _pixels(points: Float[np.ndarray, "n 3"], grid: RangeGrid, most: int) -> _Pixels | None:
+def _pixels(points: Points, grid: RangeGrid, most: int) -> _Pixels | None:
     """Pixels with places, evenly drawn; None where they do not span rows, columns and space."""
     rows, columns = np.nonzero(grid.index >= 0)
     every = max(1, len(rows) // most)
@@ -296,9 +295,7 @@ def _pencil(
     return _Pencil(p[:4], np.append(p[4:], 1.0), off)
 
 
-def _far_away(
-    points_mm: Float[np.ndarray, "n 3"], grid: RangeGrid, options: ViewpointOptions
-) -> Viewpoint | None:
+def _far_away(points_mm: Points, grid: RangeGrid, options: ViewpointOptions) -> Viewpoint | None:
     """Far along z, on the side that the rims tell; None where they do not."""
     seen = depths_of(points_mm, grid)
     if seen is None:
@@ -324,7 +321,7 @@ def _far_away(
 
 
 def straight_from(
-    points_mm: Float[np.ndarray, "m 3"], towards: Float[np.ndarray, " 3"], pixel_mm: float
+    points_mm: Float[np.ndarray, "m 3"], towards: Vector, pixel_mm: float
 ) -> Viewpoint:
     """A sensor so far away that its rays are parallel to `towards`, to a pixel over the depth."""
     middle = points_mm.mean(axis=0)
@@ -336,10 +333,7 @@ def straight_from(
 
 
 def _along_the_way(
-    points: Float[np.ndarray, "m 3"],
-    grid: RangeGrid,
-    points_mm: Float[np.ndarray, "n 3"],
-    slits: _Slits,
+    points: Float[np.ndarray, "m 3"], grid: RangeGrid, points_mm: Points, slits: _Slits
 ) -> Viewpoint:
     """Places along the way of a sheet; each stands for the stretch that it is the middle of."""
     pixel = np.nonzero(grid.index >= 0)[1 - slits.image_along].astype(np.float64)

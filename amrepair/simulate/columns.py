@@ -13,6 +13,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Box, HeightMap
 from amrepair.errors import InputError
 from amrepair.simulate import columns_kernels as kernels
 from gcode.meshes import mesh_of
@@ -100,23 +101,21 @@ class IntervalMap:
         before = np.concatenate([[0], np.cumsum(keep)])
         return IntervalMap(self.window, before[self.offsets], self.spans_mm[keep])
 
-    def thickness_mm(
-        self, z_low_mm: float = -np.inf, z_high_mm: float = np.inf
-    ) -> Float[np.ndarray, "ny nx"]:
+    def thickness_mm(self, z_low_mm: float = -np.inf, z_high_mm: float = np.inf) -> HeightMap:
         """(ny, nx) solid length of each column between two heights."""
         lengths = kernels.column_lengths(
             self.offsets, self.spans_mm, float(z_low_mm), float(z_high_mm)
         )
         return np.asarray(lengths).reshape(self.window.shape)
 
-    def top_mm(self) -> Float[np.ndarray, "ny nx"]:
+    def top_mm(self) -> HeightMap:
         """(ny, nx) height of the highest solid; 0, the bed, where there is none."""
         top = np.zeros(len(self.offsets) - 1)
         filled = np.diff(self.offsets) > 0
         top[filled] = self.spans_mm[self.offsets[1:][filled] - 1, 1]
         return top.reshape(self.window.shape)
 
-    def clipped(self, box_mm: Float[np.ndarray, "2 3"]) -> IntervalMap:
+    def clipped(self, box_mm: Box) -> IntervalMap:
         """What lies within a box, by column centre in XY and exactly in Z; the same window."""
         lows = np.maximum(self.spans_mm[:, 0], box_mm[0, 2])
         highs = np.minimum(self.spans_mm[:, 1], box_mm[1, 2])
@@ -135,7 +134,7 @@ class IntervalMap:
         offsets = np.concatenate([[0], np.cumsum(np.bincount(column[keep], minlength=ny * nx))])
         return IntervalMap(self.window, offsets, np.stack([lows[keep], highs[keep]], axis=1))
 
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"] | None:
+    def bounds_mm(self) -> Box | None:
         """(2, 3) box around all intervals, build frame; None where there are none."""
         if len(self.spans_mm) == 0:
             return None

@@ -13,8 +13,8 @@ from types import MappingProxyType
 
 import manifold3d as m3
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Values
 from amrepair.errors import InputError
 from amrepair.simulate import placement
 from amrepair.simulate.placed import Defect, Option, PlacedDefect, Printed
@@ -135,7 +135,7 @@ def parse_defect(text: str) -> Defect:
 def place(
     defect: Defect,
     part: m3.Manifold,
-    tops_mm: Float[np.ndarray, " n"],
+    tops_mm: Values,
     rng: np.random.Generator,
     *,
     beads: Beads | None = None,

@@ -9,6 +9,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Box, Values
 from gcode.reader.job import Beads
 
 
@@ -57,7 +58,7 @@ class Printed:
     """
 
     part: manifold3d.Manifold
-    tops_mm: Float[np.ndarray, " n"]
+    tops_mm: Values
     beads: Beads | None = None
 
 
@@ -85,7 +86,7 @@ class PlacedDefect:
     flow_regions: Float[np.ndarray, "n 9"]
     removed: manifold3d.Manifold | None
     added: manifold3d.Manifold | None
-    box_mm: Float[np.ndarray, "2 3"]
+    box_mm: Box
 
     @property
     def last_layer(self) -> int | None:

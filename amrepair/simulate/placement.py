@@ -9,6 +9,7 @@ import manifold3d as m3
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Values, Vector
 from amrepair.errors import InputError
 from amrepair.simulate.options import USUAL_PLACEMENT
 from amrepair.simulate.placed import Defect, PlacedDefect, Printed
@@ -18,9 +19,7 @@ from gcode.reader.job import Beads
 _EVERYWHERE_MM = 1e9
 
 
-def _layer_ranges(
-    defect: Defect, tops_mm: Float[np.ndarray, " n"], rng: np.random.Generator
-) -> list[range]:
+def _layer_ranges(defect: Defect, tops_mm: Values, rng: np.random.Generator) -> list[range]:
     """Candidate layer ranges in random order; the one asked for where there is one."""
     count = min(int(defect.values["layers"]), max(1, len(tops_mm) - 2))
     asked = int(defect.values["layer"])
@@ -35,7 +34,7 @@ def _layer_ranges(
     return [range(int(last) - count + 1, int(last) + 1) for last in lasts[: USUAL_PLACEMENT.tries]]
 
 
-def _z_range(layers: range, tops_mm: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _z_range(layers: range, tops_mm: Values) -> tuple[float, float]:
     """Nozzle heights (above, up to) that belong to the layers and to no other."""
     below = tops_mm[layers[0] - 1] if layers[0] > 0 else 0.0
     low = 0.5 * (below + tops_mm[layers[0]])
@@ -44,9 +43,7 @@ def _z_range(layers: range, tops_mm: Float[np.ndarray, " n"]) -> tuple[float, fl
     return float(low), float(0.5 * (tops_mm[last] + above))
 
 
-def _solid_through(
-    part: m3.Manifold, layers: range, tops_mm: Float[np.ndarray, " n"]
-) -> m3.CrossSection:
+def _solid_through(part: m3.Manifold, layers: range, tops_mm: Values) -> m3.CrossSection:
     """Where the part is solid from the layer under the range to its last layer."""
     bottoms = np.concatenate([[0.0], tops_mm[:-1]])
     middles = 0.5 * (bottoms + tops_mm)
@@ -201,7 +198,7 @@ def _stretches(
     return found
 
 
-def _even(part: m3.Manifold, layers: range, tops_mm: Float[np.ndarray, " n"]) -> bool:
+def _even(part: m3.Manifold, layers: range, tops_mm: Values) -> bool:
     """Whether the part's section stays the same over the layers."""
     room = _solid_through(part, layers, tops_mm).area()
     bottoms = np.concatenate([[0.0], tops_mm[:-1]])
@@ -210,7 +207,7 @@ def _even(part: m3.Manifold, layers: range, tops_mm: Float[np.ndarray, " n"]) ->
 
 
 def _bite(
-    centre_mm: Float[np.ndarray, " 3"],
+    centre_mm: Vector,
     radius_mm: float,
     depth_mm: float,
     roughness_mm: float,

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import PlanePoints, Points, Values, Vector
 from amrepair.errors import InputError
 from amrepair.simulate.options import USUAL_RECORDING
 
@@ -46,9 +47,9 @@ class ViewResiduals:
         (n,) signed distance to the surface, positive outside; NaN where it is not known.
     """
 
-    points_mm: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    deviation_mm: Float[np.ndarray, " n"]
+    points_mm: Points
+    normals: Points
+    deviation_mm: Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +83,7 @@ class Recording:
         return SIGMA_OF_MAD * float(np.median(np.abs(found - np.median(found))))
 
 
-def edge_distance_mm(
-    plane_mm: Float[np.ndarray, "n 2"], depth_mm: Float[np.ndarray, " n"], cell_mm: float
-) -> Float[np.ndarray, " n"]:
+def edge_distance_mm(plane_mm: PlanePoints, depth_mm: Values, cell_mm: float) -> Values:
     """(n,) distance of points of a view from the next gap or step in depth, in its image plane."""
     at = np.floor((plane_mm - plane_mm.min(axis=0)) / cell_mm).astype(np.int64) + 1
     depth = np.full(tuple(at.max(axis=0) + 2), np.nan)
@@ -144,9 +143,7 @@ def record(views: Sequence[ViewResiduals], *, source: str) -> Recording:
     return Recording(pitch, whole[0], whole[1], whole[2], np.array(offsets), source)
 
 
-def view_offset_mm(
-    normals: Float[np.ndarray, "n 3"], deviation_mm: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " 3"]:
+def view_offset_mm(normals: Points, deviation_mm: Values) -> Vector:
     """(3,) the shift that explains most of a view's deviations: least squares, outliers cut."""
     use = np.isfinite(deviation_mm) & (np.abs(deviation_mm) < USUAL_RECORDING.farthest_mm)
     shift = np.zeros(3)
@@ -158,12 +155,12 @@ def view_offset_mm(
     return np.asarray(shift)
 
 
-def _spacing_mm(plane_mm: Float[np.ndarray, "n 2"]) -> float:
+def _spacing_mm(plane_mm: PlanePoints) -> float:
     return float(np.median(cKDTree(plane_mm).query(plane_mm[::10], k=2)[0][:, 1]))
 
 
 def _raster(
-    plane_mm: Float[np.ndarray, "n 2"], values: Sequence[np.ndarray], pitch_mm: float
+    plane_mm: PlanePoints, values: Sequence[np.ndarray], pitch_mm: float
 ) -> Float[np.ndarray, "m ny nx"]:
     """Each cell's values are those of the point nearest to its middle."""
     cell = (plane_mm - plane_mm.min(axis=0)) / pitch_mm

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import Numbers, PlanePoints, Points, Values, Vector
 from amrepair.simulate.options import USUAL_REPLAY
 from amrepair.simulate.recording import Recording, edge_distance_mm
 
@@ -75,13 +76,13 @@ class Replay:
 
     def errors_mm(
         self,
-        points_mm: Float[np.ndarray, "n 3"],
-        normals: Float[np.ndarray, "n 3"],
-        sensor_mm: Float[np.ndarray, " 3"],
+        points_mm: Points,
+        normals: Points,
+        sensor_mm: Vector,
         *,
         spacing_mm: float,
         rng: np.random.Generator,
-    ) -> Float[np.ndarray, "n 3"]:
+    ) -> Points:
         """(n, 3) errors of one view: residuals along the surface's normals, and one shift.
 
         Parameters
@@ -112,12 +113,8 @@ class Replay:
         return np.asarray(residual[:, None] * normals + shift @ frame)
 
     def residual_mm(
-        self,
-        plane_mm: Float[np.ndarray, "n 2"],
-        cosine: Float[np.ndarray, " n"],
-        edge_mm: Float[np.ndarray, " n"],
-        rng: np.random.Generator,
-    ) -> Float[np.ndarray, " n"]:
+        self, plane_mm: PlanePoints, cosine: Values, edge_mm: Values, rng: np.random.Generator
+    ) -> Values:
         """(n,) recorded residuals for points of an image plane, by incidence and edges."""
         by_edge = (edge_mm < USUAL_REPLAY.spot_edge_mm).astype(np.int64)
         shifted = (plane_mm - plane_mm.min(axis=0)) / USUAL_REPLAY.block_mm + rng.random(2)
@@ -170,9 +167,7 @@ class Replay:
             fits & (np.abs(cosine - wanted.cosine[todo]) <= USUAL_REPLAY.similar_cosine)
         )
 
-    def _cells(
-        self, piece: _Piece, plane_mm: Float[np.ndarray, "n 2"]
-    ) -> tuple[int, Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    def _cells(self, piece: _Piece, plane_mm: PlanePoints) -> tuple[int, Numbers, Numbers]:
         """View, rows and columns that places of the image plane lie on; at its border outside."""
         view, row, column = (int(value) for value in piece.cell)
         step = np.rint((plane_mm - piece.origin_mm) @ piece.turn.T / self._pitch_mm)

@@ -13,8 +13,8 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Box, Points
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import (
@@ -109,7 +109,7 @@ class SimulatedRun:
     truth: tuple[DefectTruth, ...]
     printer_clock_s: float
     print_wall_s: float
-    temperatures: Float[np.ndarray, "n 3"]
+    temperatures: Points
     felt: tuple[Felt, ...] = ()
 
     @property
@@ -119,7 +119,7 @@ class SimulatedRun:
         return sum(t.filled_mm3 for t in self.truth) / missing if missing > 0 else None
 
 
-def place_on_bed(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> Transform:
+def place_on_bed(bounds_mm: Box, setup: PrintSetup) -> Transform:
     """Pose of a part that stands in the middle of the bed as its file has it.
 
     Raises
@@ -144,7 +144,7 @@ def place_on_bed(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> Tran
     )
 
 
-def scale_to_fit(bounds_mm: Float[np.ndarray, "2 3"], setup: PrintSetup) -> float:
+def scale_to_fit(bounds_mm: Box, setup: PrintSetup) -> float:
     """Factor that makes a part fit the printer with a margin; never above 1."""
     size = bounds_mm[1] - bounds_mm[0]
     room = np.array([*setup.printer.bed_size_mm, setup.printer.max_z_mm])

@@ -13,8 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
+from amrepair.arrays import Box, HeightMap, Mask, Numbers, Points, Values, Vector
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.scans.scan import Scan
@@ -195,9 +196,7 @@ class SimulatedScanner:
             source=f"simulated:{request.label}",
         )
 
-    def _targets(
-        self, sensor: Float[np.ndarray, " 3"], bounds: Float[np.ndarray, "2 3"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def _targets(self, sensor: Vector, bounds: Box) -> Points:
         """(n, 3) points of the bed that rays aim at: the part's shadow and a margin, dithered."""
         margin_mm = self.model.bed_margin_mm
         low, high = bounds[0, :2] - margin_mm, bounds[1, :2] + margin_mm
@@ -214,13 +213,8 @@ class SimulatedScanner:
         return np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
 
     def _measured(
-        self,
-        points: Float[np.ndarray, "n 3"],
-        normals: Float[np.ndarray, "n 3"],
-        kinds: Int[np.ndarray, " n"],
-        sensor: Float[np.ndarray, " 3"],
-        bounds: Float[np.ndarray, "2 3"],
-    ) -> Bool[np.ndarray, " n"]:
+        self, points: Points, normals: Points, kinds: Numbers, sensor: Vector, bounds: Box
+    ) -> Mask:
         """(n,) which points send enough light back, and are asked for."""
         cosine = _cosine(points, normals, sensor)
         margin_mm = self.model.bed_margin_mm
@@ -233,12 +227,8 @@ class SimulatedScanner:
         return np.asarray(keep)
 
     def _unhidden(
-        self,
-        solid: IntervalMap,
-        top_mm: Float[np.ndarray, "ny nx"],
-        sensor: Float[np.ndarray, " 3"],
-        points: Float[np.ndarray, "n 3"],
-    ) -> Bool[np.ndarray, " n"]:
+        self, solid: IntervalMap, top_mm: HeightMap, sensor: Vector, points: Points
+    ) -> Mask:
         """(n,) which points the camera sees too, a baseline beside the light."""
         if self.model.baseline_mm == 0.0:
             return np.ones(len(points), dtype=bool)
@@ -261,12 +251,7 @@ class SimulatedScanner:
             )
         )
 
-    def _noise(
-        self,
-        points: Float[np.ndarray, "n 3"],
-        normals: Float[np.ndarray, "n 3"],
-        sensor: Float[np.ndarray, " 3"],
-    ) -> Float[np.ndarray, "n 3"]:
+    def _noise(self, points: Points, normals: Points, sensor: Vector) -> Points:
         """(n, 3) errors, all along the rays."""
         rays = points - sensor
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -279,11 +264,7 @@ class SimulatedScanner:
         return np.asarray(rays * spread[:, None])
 
 
-def _cosine(
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    sensor: Float[np.ndarray, " 3"],
-) -> Float[np.ndarray, " n"]:
+def _cosine(points: Points, normals: Points, sensor: Vector) -> Values:
     """(n,) cosine of the angle of incidence."""
     rays = points - sensor
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

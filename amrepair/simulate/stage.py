@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
-from jaxtyping import Bool
 from scipy import ndimage
 
+from amrepair.arrays import ColumnMask
 from amrepair.frames import Transform
 from amrepair.loop.probing import ProbeScanner
 from amrepair.loop.wire import Wire
@@ -268,9 +268,7 @@ class Stage:
         return self.world.columns.box_window((x0, y0), (x1, y1))
 
 
-def _even(
-    standing: IntervalMap, wanted: IntervalMap, tolerance_mm: float
-) -> Bool[np.ndarray, "ny nx"]:
+def _even(standing: IntervalMap, wanted: IntervalMap, tolerance_mm: float) -> ColumnMask:
     """Columns whose top is as high as the reference's within a tolerance up, down and sideways.
 
     Sideways it is one column: at a wall, height says nothing.

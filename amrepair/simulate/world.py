@@ -16,8 +16,8 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Points, Values
 from amrepair.errors import InputError
 from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.columns_kernels import Stacks
@@ -201,7 +201,7 @@ class World:
             thermal=np.array(thermal),
         )
 
-    def as_cooled(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def as_cooled(self, points_mm: Points) -> Points:
         """(n, 3) where points of the part as it was laid are now, build frame."""
         if self.thermal.shrink_ratio == 0.0 and self.thermal.curl_per_mm == 0.0:
             return points_mm
@@ -218,9 +218,7 @@ class World:
         top_mm = float(self._layer_tops_mm[-1]) if len(self._layer_tops_mm) else 0.0
         return float(self.thermal.rise(top_mm + self.thermal.warm_mm))
 
-    def _as_laid(
-        self, place_mm: Float[np.ndarray, "n 3"], *, onto_cold: bool
-    ) -> Float[np.ndarray, "n 3"]:
+    def _as_laid(self, place_mm: Points, *, onto_cold: bool) -> Points:
         """Where on the part as it was laid the nozzle is (its height is the kernel's business)."""
         place = np.array(place_mm, dtype=np.float64, order="C")
         if onto_cold and self.thermal.shrink_ratio > 0.0:
@@ -279,16 +277,14 @@ class World:
         twin._before, twin._stamp = self._before.copy(), self._stamp.copy()
         return twin
 
-    def _pushed_mm(self, filament_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def _pushed_mm(self, filament_mm: Values) -> Values:
         """Filament that left the nozzle in each move: what was pulled must come back first."""
         position = np.concatenate([[-self._pulled_mm], filament_mm]).cumsum()
         front = np.maximum.accumulate(np.maximum(position, 0.0))
         self._pulled_mm = float(front[-1] - position[-1])
         return np.diff(front)
 
-    def _thickness_mm(
-        self, motion: MotionBatch, volume_mm3: Float[np.ndarray, " n"], *, onto_cold: bool
-    ) -> Float[np.ndarray, " n"]:
+    def _thickness_mm(self, motion: MotionBatch, volume_mm3: Values, *, onto_cold: bool) -> Values:
         """Layer thickness of each move: the step to the highest layer laid below its height.
 
         Bounded by what its own cross-section can fill, for moves that follow no layers. A repair

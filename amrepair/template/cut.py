@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Box, Points, Values
 from amrepair.errors import TemplateError
 from amrepair.template.port import Template
 
@@ -42,7 +43,7 @@ class CutTemplate:
             )
 
     @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+    def bounds_mm(self) -> Box:
         """(2, 3) box of what is left."""
         bounds = self.whole.bounds_mm.copy()
         bounds[1, 2] = min(bounds[1, 2], self.z_mm)
@@ -53,13 +54,11 @@ class CutTemplate:
         """That of the whole: the plane itself is exact."""
         return self.whole.bias_mm
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) max(f, z − z_k)."""
         return np.maximum(self.whole.distance(points_mm), points_mm[:, 2] - self.z_mm)
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and the gradient of whichever term is the larger."""
         distance, gradient = self.whole.distance_and_gradient(points_mm)
         above = points_mm[:, 2] - self.z_mm
@@ -67,7 +66,7 @@ class CutTemplate:
         gradient = np.where(cut[:, None], np.array([0.0, 0.0, 1.0]), gradient)
         return np.maximum(distance, above), gradient
 
-    def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def spread_mm(self, points_mm: Points) -> Values:
         """(n,) that of the whole: standard deviation between normal parts, where it is known."""
         spread = getattr(self.whole, "spread_mm", None)
         return np.zeros(len(points_mm)) if spread is None else np.asarray(spread(points_mm))

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from amrepair.arrays import Faces, Vector, Vertices
 from amrepair.errors import TemplateError
 from gcode.solids import as_manifold, is_valid
 
@@ -62,9 +63,7 @@ def extract_mesh(template: Template, voxel_mm: float, *, level_mm: float = 0.0) 
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def zero_level(
-    field: Float[np.ndarray, "nx ny nz"], voxel_mm: float
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def zero_level(field: Float[np.ndarray, "nx ny nz"], voxel_mm: float) -> tuple[Vertices, Faces]:
     """Vertices about the first node, mm, and faces of f = 0, closed within the field.
 
     Where a node lies on the surface the triangles around it shrink to nothing and are lost, and
@@ -84,7 +83,7 @@ def zero_level(
 
 def band_field(
     template: Template, voxel_mm: float, *, level_mm: float
-) -> tuple[Float[np.ndarray, "nx ny nz"], Float[np.ndarray, " 3"]]:
+) -> tuple[Float[np.ndarray, "nx ny nz"], Vector]:
     """(nx, ny, nz) float32 of f − level, exact in the band, of the right sign elsewhere.
 
     The outermost nodes are outside, whatever the template says.

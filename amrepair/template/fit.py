@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import Points, Values, Vector, Voxels
 from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.grid_kernels import NOBODY, carry, near_triangles, shared_nodes
 from amrepair.template.mesh_sdf import MeshSdf
@@ -68,7 +69,7 @@ def fit_fast(
     return GridSdf(grid=grid, mesh=exact.mesh, bias_mm=bias_mm, metadata=metadata or {})
 
 
-def _cell_mm(size_mm: Float[np.ndarray, " 3"], margin_mm: float, options: FitOptions) -> float:
+def _cell_mm(size_mm: Vector, margin_mm: float, options: FitOptions) -> float:
     """Edge of a cell: the longest side over its cells, or smaller where nodes are left."""
     largest = float(size_mm.max()) / options.cells
     nodes = options.stocky_ratio * options.cells**3
@@ -78,12 +79,12 @@ def _cell_mm(size_mm: Float[np.ndarray, " 3"], margin_mm: float, options: FitOpt
 
 def _base(
     exact: MeshSdf,
-    origin: Float[np.ndarray, " 3"],
+    origin: Vector,
     cell: float,
     shape: np.ndarray,
     options: FitOptions,
     progress: Progress,
-) -> Float[np.ndarray, "x y z"]:
+) -> Voxels:
     """(x, y, z) distances at the nodes, float32: exact near the surface.
 
     Far nodes look at many boxes of the tree before they know their triangle; their neighbours know
@@ -108,10 +109,10 @@ def _base(
 
 def _in_parts(
     ask: Callable[[Float[np.ndarray, "k 3"]], Float[np.ndarray, " k"]],
-    points_mm: Float[np.ndarray, "n 3"],
+    points_mm: Points,
     what: str,
     progress: Progress,
-) -> Float[np.ndarray, " n"]:
+) -> Values:
     """(n,) answers at points, some at a time."""
     found = np.empty(len(points_mm))
     for first in range(0, len(points_mm), AT_ONCE):
@@ -121,15 +122,13 @@ def _in_parts(
     return found
 
 
-def _on_surface(exact: MeshSdf, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+def _on_surface(exact: MeshSdf, count: int, rng: np.random.Generator) -> Points:
     vertices, faces = np.asarray(exact.mesh.vertices), np.asarray(exact.mesh.faces)
     points, _, _ = sample_surface(vertices, faces, count=count, offset=float(rng.random()))
     return points
 
 
-def _samples(
-    exact: MeshSdf, count: int, band_mm: float, rng: np.random.Generator
-) -> Float[np.ndarray, "n 3"]:
+def _samples(exact: MeshSdf, count: int, band_mm: float, rng: np.random.Generator) -> Points:
     """Points around the surface, half of them close to it."""
     points = _on_surface(exact, count, rng)
     spread = np.where(rng.random(len(points)) < 0.5, 0.25, 1.0) * band_mm
@@ -137,11 +136,7 @@ def _samples(
 
 
 def _bent(
-    bare: Grid,
-    points: Float[np.ndarray, "n 3"],
-    residual: Float[np.ndarray, " n"],
-    least_mm: float,
-    options: FitOptions,
+    bare: Grid, points: Points, residual: Values, least_mm: float, options: FitOptions
 ) -> Int[np.ndarray, "b 3"]:
     """(b, 3) cells where the coarse grid is not good enough, and their neighbours."""
     worst = np.zeros(bare.block_of.shape)

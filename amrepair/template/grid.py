@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Mask, Points, Values, Vector, Voxels
 from amrepair.errors import TemplateError
 from amrepair.frames import cells_of, diagonal, unit_vectors
 from amrepair.template import trilinear_kernels as kernels
@@ -53,16 +54,14 @@ class Grid:
         (b, r+1, r+1, r+1) distances at the nodes that divide a cell into r³, float32.
     """
 
-    origin_mm: Float[np.ndarray, " 3"]
+    origin_mm: Vector
     cell_mm: float
-    base: Float[np.ndarray, "x y z"]
+    base: Voxels
     block_of: Int[np.ndarray, "_x _y _z"]
     blocks: Float[np.ndarray, "b r r r"]
 
     @classmethod
-    def bare(
-        cls, origin_mm: Float[np.ndarray, " 3"], cell_mm: float, base: Float[np.ndarray, "x y z"]
-    ) -> Grid:
+    def bare(cls, origin_mm: Vector, cell_mm: float, base: Voxels) -> Grid:
         """The coarse grid alone."""
         return cls.refined(
             origin_mm, cell_mm, base, np.zeros((0, 3), np.int64), np.zeros((0, 2, 2, 2))
@@ -71,9 +70,9 @@ class Grid:
     @classmethod
     def refined(
         cls,
-        origin_mm: Float[np.ndarray, " 3"],
+        origin_mm: Vector,
         cell_mm: float,
-        base: Float[np.ndarray, "x y z"],
+        base: Voxels,
         cells: Int[np.ndarray, "b 3"],
         blocks: Float[np.ndarray, "b r r r"],
     ) -> Grid:
@@ -96,19 +95,17 @@ class Grid:
         found[self.block_of[tuple(which.T)]] = which
         return found
 
-    def cell_of(self, points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 3"]:
+    def cell_of(self, points_mm: Points) -> Int[np.ndarray, "n 3"]:
         """(n, 3) indices of the coarse cells that hold the points, or the nearest ones."""
         index = cells_of(points_mm, self.origin_mm, self.cell_mm)
         return np.clip(index, 0, np.array(self.block_of.shape) - 1)
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance, mm."""
         points = read_only(points_mm, np.float64)
         return np.asarray(kernels.evaluate(points, *self.numbers))
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance, mm, and (n, 3) its gradient within the cell."""
         points = read_only(points_mm, np.float64)
         distance, gradient = kernels.evaluate_with_gradient(points, *self.numbers)
@@ -149,12 +146,7 @@ class Coverage:
 
     @classmethod
     def of(
-        cls,
-        places_mm: Float[np.ndarray, "n 3"],
-        normals: Float[np.ndarray, "n 3"],
-        area_mm2: Float[np.ndarray, " n"],
-        unseen: Bool[np.ndarray, " n"],
-        reach_mm: float,
+        cls, places_mm: Points, normals: Points, area_mm2: Values, unseen: Mask, reach_mm: float
     ) -> Coverage:
         """Of all pieces of a surface: where, how each faces, how large it is, whether unseen.
 
@@ -176,12 +168,7 @@ class Coverage:
             cKDTree(self.place_mm[self.unseen]),
         )
 
-    def unknown_at(
-        self,
-        points_mm: Float[np.ndarray, "n 3"],
-        f_mm: Float[np.ndarray, " n"],
-        outward: Float[np.ndarray, "n 3"],
-    ) -> Bool[np.ndarray, " n"]:
+    def unknown_at(self, points_mm: Points, f_mm: Values, outward: Points) -> Mask:
         """(n,) whether nobody knows the surface that places near it are told by.
 
         It is the piece at a place's foot; and where one that nobody saw, and that is a guess, lies
@@ -204,13 +191,13 @@ class Coverage:
         found[rest] = to_guess <= np.abs(f_mm[rest])
         return np.asarray(found)
 
-    def to_guess_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def to_guess_mm(self, points_mm: Points) -> Values:
         """(n,) how far it is to surface that nobody saw, and that is a guess; inf without any."""
         return np.asarray(self._trees[2].query(points_mm, workers=-1)[0], np.float64)
 
 
 def surface_elements(
-    places_mm: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], reach_mm: float
+    places_mm: Points, normals: Points, reach_mm: float
 ) -> Float[np.ndarray, "n 6"]:
     """(n, 6) places with how they face: opposite ways they lie `reach_mm` apart at least."""
     return np.hstack([places_mm, 0.5 * reach_mm * normals])
@@ -238,17 +225,15 @@ class GridSdf(MeshShape):
     metadata: dict[str, str] = field(default_factory=dict)
     coverage: Coverage | None = None
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance, mm, negative inside."""
         return self.grid.distance(points_mm)
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and (n, 3) its gradient."""
         return self.grid.distance_and_gradient(points_mm)
 
-    def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def spread_mm(self, points_mm: Points) -> Values:
         """(n,) standard deviation between normal parts: the part's size where nobody knows."""
         found = self._told_spread_mm(points_mm)
         if self.coverage is not None:
@@ -257,7 +242,7 @@ class GridSdf(MeshShape):
             found = np.where(unknown, diagonal(self.bounds_mm), found)
         return found
 
-    def _told_spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def _told_spread_mm(self, points_mm: Points) -> Values:
         """(n,) what scans say of the spread: none was asked."""
         return np.zeros(len(points_mm))
 

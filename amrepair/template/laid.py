@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.ndimage import uniform_filter
 
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import TemplateError
 from amrepair.template import laid_kernels as kernels
 
@@ -141,10 +142,10 @@ class LaidBeads:
         Plastic of layers that earlier looks at the same job asked for.
     """
 
-    start_mm: Float[np.ndarray, "n 3"]
-    end_mm: Float[np.ndarray, "n 3"]
-    section_mm2: Float[np.ndarray, " n"]
-    height_mm: Float[np.ndarray, " n"]
+    start_mm: Points
+    end_mm: Points
+    section_mm2: Values
+    height_mm: Values
     first: Int[np.ndarray, " k1"]
     top_mm: Float[np.ndarray, " k"]
     layer_mm: Float[np.ndarray, " k"]
@@ -155,11 +156,11 @@ class LaidBeads:
     @classmethod
     def from_beads(
         cls,
-        start_mm: Float[np.ndarray, "n 3"],
-        end_mm: Float[np.ndarray, "n 3"],
-        section_mm2: Float[np.ndarray, " n"],
-        height_mm: Float[np.ndarray, " n"],
-        layer: Int[np.ndarray, " n"],
+        start_mm: Points,
+        end_mm: Points,
+        section_mm2: Values,
+        height_mm: Values,
+        layer: Numbers,
         *,
         options: LaidOptions = LaidOptions(),
         kept: KeptFills | None = None,

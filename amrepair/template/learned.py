@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from amrepair.arrays import Points, Values, Vector, Voxels
 from amrepair.frames import cells_of
 from amrepair.template.grid import GridSdf, stored_grid
 
@@ -34,11 +34,11 @@ class Tolerance:
         (x, y, z) standard deviation between normal parts; 0 away from the surface.
     """
 
-    origin_mm: Float[np.ndarray, " 3"]
+    origin_mm: Vector
     cell_mm: float
-    spread_mm: Float[np.ndarray, "x y z"]
+    spread_mm: Voxels
 
-    def at(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def at(self, points_mm: Points) -> Values:
         """(n,) spread at the points; beyond the cells that of the nearest."""
         index = cells_of(points_mm, self.origin_mm, self.cell_mm)
         index = np.clip(index, 0, np.array(self.spread_mm.shape) - 1)
@@ -63,7 +63,7 @@ class LearnedSdf(GridSdf):
         known = {f.name: getattr(taught, f.name) for f in fields(GridSdf)}
         return cls(**known, tolerance=tolerance)
 
-    def _told_spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def _told_spread_mm(self, points_mm: Points) -> Values:
         return self.tolerance.at(points_mm)
 
     def _packed(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

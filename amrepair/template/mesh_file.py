@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
+from amrepair.arrays import Faces, Vertices
 from amrepair.errors import InputError, TemplateError
 from amrepair.template.options import USUAL_MESH, MeshOptions
 from gcode.meshes import mesh_of
@@ -132,7 +133,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def edge_census(faces: Int[np.ndarray, "f 3"]) -> EdgeCensus:
+def edge_census(faces: Faces) -> EdgeCensus:
     """Count how often each undirected edge is used."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
     keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
@@ -175,7 +176,7 @@ def close_mesh(
     return trimesh.Trimesh(closed_vertices, closed_faces, process=False), tuple(notes)
 
 
-def _refuse_bad_numbers(vertices: Float[np.ndarray, "v 3"], source: str) -> None:
+def _refuse_bad_numbers(vertices: Vertices, source: str) -> None:
     bad = int((~np.isfinite(vertices)).any(axis=1).sum())
     if bad:
         raise TemplateError(
@@ -230,7 +231,7 @@ def _mend(mesh: trimesh.Trimesh, source: str, notes: list[str], options: MeshOpt
     return solid
 
 
-def _with_lids(faces: Int[np.ndarray, "f 3"], options: MeshOptions) -> Int[np.ndarray, "g 3"]:
+def _with_lids(faces: Faces, options: MeshOptions) -> Int[np.ndarray, "g 3"]:
     """Faces with a fan of triangles over every small loop of open edges."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     both = {(int(a), int(b)) for a, b in edges}

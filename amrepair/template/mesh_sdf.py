@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
 
+from amrepair.arrays import Mask, Points, Values
 from amrepair.template.mesh_file import require_mesh
 from amrepair.template.nearest import Nearest, TriangleTree
 from amrepair.template.shape import MeshShape
@@ -54,22 +54,20 @@ class MeshSdf(MeshShape):
         """None: it is exact."""
         return 0.0
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance, mm."""
         found = self._tree.nearest(points_mm)
         return self._outward(points_mm, found) * found.size_mm
 
-    def unsigned_distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def unsigned_distance(self, points_mm: Points) -> Values:
         """(n,) distance to the nearest triangle, mm; cheaper where the sign is not asked."""
         return self._tree.nearest(points_mm).size_mm
 
-    def inside(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def inside(self, points_mm: Points) -> Mask:
         """(n,) whether points lie inside."""
         return self._tree.inside(points_mm)
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and (n, 3) unit gradient, from the nearest points."""
         found = self._tree.nearest(points_mm)
         size, outward = found.size_mm, self._outward(points_mm, found)
@@ -78,9 +76,7 @@ class MeshSdf(MeshShape):
         gradient = np.where((size > TOUCHING_MM)[:, None], direction, normal)
         return outward * size, gradient
 
-    def _outward(
-        self, points_mm: Float[np.ndarray, "n 3"], found: Nearest
-    ) -> Float[np.ndarray, " n"]:
+    def _outward(self, points_mm: Points, found: Nearest) -> Values:
         """(n,) 1 outside, −1 inside."""
         outward = found.side.astype(np.float64)
         unclear = np.flatnonzero(found.side == 0)

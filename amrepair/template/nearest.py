@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from amrepair.arrays import Faces, Mask, Numbers, Points, Values, Vertices
 from amrepair.template import nearest_kernels as kernels
 from amrepair.template.surface import triangle_areas_normals
 from gcode.compiled import read_only
@@ -39,10 +40,10 @@ class Nearest:
         (n, 3) on them.
     """
 
-    size_mm: Float[np.ndarray, " n"]
-    side: Int[np.ndarray, " n"]
-    face: Int[np.ndarray, " n"]
-    place_mm: Float[np.ndarray, "n 3"]
+    size_mm: Values
+    side: Numbers
+    face: Numbers
+    place_mm: Points
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +77,7 @@ class TriangleTree:
     sure: Bool[np.ndarray, " f"]
 
     @classmethod
-    def of(
-        cls, vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-    ) -> TriangleTree:
+    def of(cls, vertices_mm: Vertices, faces: Faces) -> TriangleTree:
         """Sort a closed mesh's triangles."""
         corners = np.ascontiguousarray(vertices_mm[faces], dtype=np.float64)
         order, low, high, child, first, last = kernels.build(corners)
@@ -92,7 +91,7 @@ class TriangleTree:
         middle = corners.mean(axis=1)
         return replace(tree, sure=tree.inside(middle - aside) & ~tree.inside(middle + aside))
 
-    def nearest(self, points_mm: Float[np.ndarray, "n 3"]) -> Nearest:
+    def nearest(self, points_mm: Points) -> Nearest:
         """What of the triangles is nearest to points."""
         points = read_only(points_mm, np.float64)
         if len(points) < SORTED:
@@ -111,7 +110,7 @@ class TriangleTree:
         )
         return Nearest(size[back], side[back], self.face[which[back]], place[back])
 
-    def inside(self, points_mm: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    def inside(self, points_mm: Points) -> Mask:
         """(n,) whether points lie inside a closed mesh."""
         points = read_only(points_mm, np.float64)
         return np.asarray(kernels.crossed_odd(points, WAY, *self._numbers))
@@ -121,7 +120,7 @@ class TriangleTree:
         return self.corners_mm, self.low_mm, self.high_mm, self.child, self.first, self.last
 
 
-def _has_folds(faces: Int[np.ndarray, "f 3"], normals: Float[np.ndarray, "f 3"]) -> bool:
+def _has_folds(faces: Faces, normals: Float[np.ndarray, "f 3"]) -> bool:
     """Whether a triangle lies on one that it shares an edge with."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     order = np.lexsort((edges[:, 1], edges[:, 0]))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Points, Values, Vector
 from amrepair.errors import TemplateError
 from amrepair.template.file import require_kind, stored_mesh, stored_metadata, write_template
 from amrepair.template.shape import MeshShape
@@ -101,13 +102,13 @@ class PaperSdf(MeshShape):
     architecture: Architecture
     weights: tuple[Float[np.ndarray, "_o _i"], ...]
     biases: tuple[Float[np.ndarray, " _o"], ...]
-    centre_mm: Float[np.ndarray, " 3"]
+    centre_mm: Vector
     radius_mm: float
     mesh: trimesh.Trimesh
     bias_mm: float
     metadata: dict[str, str] = field(default_factory=dict)
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance, mm, negative inside."""
         import torch
 
@@ -118,9 +119,7 @@ class PaperSdf(MeshShape):
                 found[chunk] = self._answer(inside).numpy() + norm
         return found * self.radius_mm
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and (n, 3) its gradient, by differentiating the network."""
         import torch
 
@@ -137,7 +136,7 @@ class PaperSdf(MeshShape):
         return found * self.radius_mm, gradient
 
     def _chunks(
-        self, points_mm: Float[np.ndarray, "n 3"]
+        self, points_mm: Points
     ) -> Iterator[tuple[slice, torch.Tensor, Float[np.ndarray, "k 3"]]]:
         """Slices, their points in the network's frame and cube, and what lies beyond it."""
         import torch

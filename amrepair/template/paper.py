@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
+from amrepair.arrays import Points, Values, Vector
 from amrepair.device import torch_device
 from amrepair.errors import TemplateError
 from amrepair.template.mesh_sdf import MeshSdf
@@ -165,11 +166,11 @@ def fit_paper(
 
 def _queries(
     exact: MeshSdf,
-    centre_mm: Float[np.ndarray, " 3"],
+    centre_mm: Vector,
     radius_mm: float,
     options: PaperOptions,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "n 3"]:
+) -> Points:
     """(n, 3) where the network is taught: surface, box, unit volume."""
     vertices, faces = np.asarray(exact.mesh.vertices), np.asarray(exact.mesh.faces)
     on = sample_surface(vertices, faces, count=max(options.surface, 1), offset=rng.random())[0]
@@ -181,10 +182,8 @@ def _queries(
 
 
 def _from_cloud(
-    points_mm: Float[np.ndarray, "n 3"],
-    cloud_mm: Float[np.ndarray, "m 3"],
-    normals: Float[np.ndarray, "m 3"],
-) -> Float[np.ndarray, " n"]:
+    points_mm: Points, cloud_mm: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"]
+) -> Values:
     """Supplement, eq. (1): nearest surface point; sign of the offset against its normal."""
     distance, index = cKDTree(cloud_mm).query(points_mm, workers=-1)
     side = ((points_mm - cloud_mm[index]) * normals[index]).sum(axis=1)
@@ -219,12 +218,7 @@ def _forward(layers: Any, inputs: torch.Tensor, options: PaperOptions, training:
 
 
 def _train(
-    local: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, " n"],
-    options: PaperOptions,
-    device: str,
-    seed: int,
-    progress: Progress,
+    local: Points, target: Values, options: PaperOptions, device: str, seed: int, progress: Progress
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...], int]:
     """Weights and biases that did best on the validation queries, and the steps taken."""
     import torch

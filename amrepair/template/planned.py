@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from amrepair.arrays import Box, Points, Values, Vector, VoxelMask, Voxels
 from amrepair.errors import TemplateError
 from amrepair.template import planned_kernels as kernels
 from amrepair.template.cut import CutTemplate
@@ -36,20 +37,20 @@ class PlannedSdf:
         Beads lie below them: its foot is not the bed's height.
     """
 
-    origin_mm: Float[np.ndarray, " 3"]
+    origin_mm: Vector
     voxel_mm: float
-    bounds_mm: Float[np.ndarray, "2 3"]
-    _field: Float[np.ndarray, "x y z"] = field(repr=False)
-    _solid: Bool[np.ndarray, "x y z"] = field(repr=False)
+    bounds_mm: Box
+    _field: Voxels = field(repr=False)
+    _solid: VoxelMask = field(repr=False)
     off_bed: bool = False
 
     @classmethod
     def from_beads(
         cls,
-        start_mm: Float[np.ndarray, "n 3"],
-        end_mm: Float[np.ndarray, "n 3"],
-        section_mm2: Float[np.ndarray, " n"],
-        height_mm: Float[np.ndarray, " n"],
+        start_mm: Points,
+        end_mm: Points,
+        section_mm2: Values,
+        height_mm: Values,
         *,
         options: PlannedOptions = USUAL_PLANNED,
     ) -> PlannedSdf:
@@ -113,14 +114,12 @@ class PlannedSdf:
         """A quarter of a voxel: what walls lose between voxel centres."""
         return 0.25 * self.voxel_mm
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance, mm; beyond the grid a lower bound of it."""
         points = read_only(points_mm, np.float64)
         return np.asarray(kernels.interpolate(points, self.origin_mm, self.voxel_mm, self._field))
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and (n, 3) its gradient, by central differences over a voxel."""
         gradient = np.empty((len(points_mm), 3))
         for axis in range(3):
@@ -163,7 +162,7 @@ class PlannedSdf:
         return as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def _signed(solid: Bool[np.ndarray, "x y z"], voxel_mm: float) -> Float[np.ndarray, "x y z"]:
+def _signed(solid: VoxelMask, voxel_mm: float) -> Voxels:
     """Signed distances at voxel centres; the surface lies midway between unlike ones."""
     to_solid = kernels.squared_distances(solid, True)
     return np.asarray(

@@ -11,18 +11,18 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Box, Points, Values
+
 
 @runtime_checkable
 class Distances(Protocol):
     """A signed distance field: all that a pose is refined by."""
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance at (n, 3) points, mm, negative inside."""
         ...
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance, mm, and its (n, 3) gradient (unit outward normal near f = 0)."""
         ...
 
@@ -32,7 +32,7 @@ class Template(Distances, Protocol):
     """A signed distance field of the expected part."""
 
     @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+    def bounds_mm(self) -> Box:
         """(2, 3) lowest and highest corner of the part, template frame."""
         ...
 

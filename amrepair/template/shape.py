@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Box
 from amrepair.template.cut import CutTemplate
 from amrepair.template.surface import mesh_points
 from gcode.solids import as_manifold
@@ -24,7 +25,7 @@ class MeshShape:
     mesh: trimesh.Trimesh
 
     @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+    def bounds_mm(self) -> Box:
         """(2, 3) box of the part."""
         return np.array(self.mesh.bounds, dtype=np.float64)
 

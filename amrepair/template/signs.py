@@ -10,23 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
+from amrepair.arrays import Mask, Points, Vector, Voxels
 from amrepair.template.signs_kernels import spread
 
 ASKED = 9  # of a region, evenly: rays that graze edges are outvoted
 SLACK = 1.0 + 1e-5  # distances are single precision
 
-Inside = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
+Inside = Callable[[Points], Mask]
 
 
-def signed_grid(
-    size_mm: Float[np.ndarray, "x y z"],
-    origin_mm: Float[np.ndarray, " 3"],
-    cell_mm: float,
-    inside: Inside,
-) -> Float[np.ndarray, "x y z"]:
+def signed_grid(size_mm: Voxels, origin_mm: Vector, cell_mm: float, inside: Inside) -> Voxels:
     """(x, y, z) distances of a grid's nodes, negative inside.
 
     Parameters
@@ -55,11 +51,7 @@ def signed_grid(
 
 
 def _sides(
-    region: Int[np.ndarray, "x y z"],
-    count: int,
-    origin_mm: Float[np.ndarray, " 3"],
-    cell_mm: float,
-    inside: Inside,
+    region: Int[np.ndarray, "x y z"], count: int, origin_mm: Vector, cell_mm: float, inside: Inside
 ) -> Int[np.ndarray, " k"]:
     """(k,) −1 or 1 for each region, by the majority of a few of its nodes."""
     flat = region.ravel()

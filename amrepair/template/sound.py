@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from scipy.special import digamma, ndtr, polygamma, stdtrit
 
+from amrepair.arrays import Points, Values, Vector
 from amrepair.errors import InputError
 from amrepair.frames import unit_vectors
 from amrepair.template.grid import Grid, GridSdf
@@ -85,11 +86,7 @@ class SoundSites:
         return cls(place, normal, options.facing_mm, tree)
 
     def nearest(
-        self,
-        points_mm: Float[np.ndarray, "n 3"],
-        f_mm: Float[np.ndarray, " n"],
-        outward: Float[np.ndarray, "n 3"],
-        count: int,
+        self, points_mm: Points, f_mm: Values, outward: Points, count: int
     ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
         """Distances and numbers of the sites nearest to where points lie over the surface."""
         feet = points_mm - f_mm[:, None] * outward
@@ -128,12 +125,8 @@ class SoundParts:
     outvoted_at_mm: Float[np.ndarray, "k 3"]
 
     def at(
-        self,
-        values: Float[np.ndarray, " s"],
-        points_mm: Float[np.ndarray, "n 3"],
-        f_mm: Float[np.ndarray, " n"],
-        outward: Float[np.ndarray, "n 3"],
-    ) -> Float[np.ndarray, " n"]:
+        self, values: Float[np.ndarray, " s"], points_mm: Points, f_mm: Values, outward: Points
+    ) -> Values:
         """(n,) a value of the sites over the surface: the four nearest, by inverse distance."""
         away, index = self.sites.nearest(points_mm, f_mm, outward, min(4, len(values)))
         weight = 1.0 / np.maximum(away, 1e-6)
@@ -175,10 +168,7 @@ def learn(
 
 
 def _means(
-    points_mm: Float[np.ndarray, "n 3"],
-    template: GridSdf,
-    sites: SoundSites,
-    options: SoundOptions,
+    points_mm: Points, template: GridSdf, sites: SoundSites, options: SoundOptions
 ) -> Float[np.ndarray, " s"]:
     """(s,) mean deviation of a scan about each site; NaN where it has too few points."""
     f_mm, gradient = template.distance_and_gradient(points_mm)
@@ -227,9 +217,7 @@ def _summary(
     )  # fmt: skip
 
 
-def _middle(
-    place_mm: Float[np.ndarray, "s 3"], which: Bool[np.ndarray, " s"]
-) -> Float[np.ndarray, " 3"]:
+def _middle(place_mm: Float[np.ndarray, "s 3"], which: Bool[np.ndarray, " s"]) -> Vector:
     return np.asarray(place_mm[which].mean(axis=0) if which.any() else np.full(3, np.nan))
 
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from amrepair.arrays import Box, Numbers, Points, Values
 from amrepair.frames import Transform, box_of
 from amrepair.template.cut import CutTemplate
 from amrepair.template.port import Template
@@ -35,7 +36,7 @@ class StoodTemplate:
 
     part: Template
     placed: tuple[Transform, ...]
-    boxes_mm: tuple[Float[np.ndarray, "2 3"], ...]
+    boxes_mm: tuple[Box, ...]
 
     @classmethod
     def of(cls, part: Template, placed: tuple[Transform, ...]) -> StoodTemplate:
@@ -44,7 +45,7 @@ class StoodTemplate:
         return cls(part, placed, tuple(box_of(pose.apply(vertices)) for pose in placed))
 
     @property
-    def bounds_mm(self) -> Float[np.ndarray, "2 3"]:
+    def bounds_mm(self) -> Box:
         """(2, 3) box of all of them."""
         return box_of(np.concatenate(self.boxes_mm))
 
@@ -53,13 +54,11 @@ class StoodTemplate:
         """That of one."""
         return self.part.bias_mm
 
-    def distance(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance to the nearest copy."""
         return self._nearest(points_mm)[0]
 
-    def distance_and_gradient(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance to the nearest copy, and (n, 3) its gradient."""
         distance, copy = self._nearest(points_mm)
         gradient = np.zeros((len(points_mm), 3))
@@ -70,7 +69,7 @@ class StoodTemplate:
                 gradient[mine] = pose.rotate(self.part.distance_and_gradient(own)[1])
         return distance, gradient
 
-    def spread_mm(self, points_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def spread_mm(self, points_mm: Points) -> Values:
         """(n,) standard deviation between normal parts at the nearest copy, where it is known."""
         spread = np.zeros(len(points_mm))
         known = getattr(self.part, "spread_mm", None)
@@ -82,9 +81,7 @@ class StoodTemplate:
             spread[mine] = known(pose.inverse().apply(points_mm[mine]))
         return spread
 
-    def _nearest(
-        self, points_mm: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    def _nearest(self, points_mm: Points) -> tuple[Values, Numbers]:
         """(n,) signed distance to the nearest copy, and which it is.
 
         A copy is asked about only where its box is nearer than what was found.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
+from amrepair.arrays import Faces, Vertices
 from amrepair.template import surface_kernels as kernels
 
 if TYPE_CHECKING:
@@ -21,18 +22,14 @@ _R2 = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
 
 
 def triangle_areas_normals(
-    vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+    vertices_mm: Vertices, faces: Faces
 ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, "f 3"]]:
     """(f,) areas in mm² and (f, 3) unit normals (zero where a triangle has no area)."""
     return kernels.areas_normals(*_for_kernels(vertices_mm, faces))
 
 
 def sample_surface(
-    vertices_mm: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    *,
-    count: int,
-    offset: float = 0.5,
+    vertices_mm: Vertices, faces: Faces, *, count: int, offset: float = 0.5
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
     """Spread `count` points over a mesh, each standing for the same area.
 
@@ -51,9 +48,7 @@ def sample_surface(
     return points, normals[triangle], triangle
 
 
-def _for_kernels(
-    vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+def _for_kernels(vertices_mm: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """The same in one type, so that each kernel is compiled once."""
     return np.ascontiguousarray(vertices_mm, np.float64), np.ascontiguousarray(faces, np.int64)
 
