@@ -29,6 +29,7 @@ import trimesh
 from promise_scans import RealScans, SimulatedScans, Sound
 from real_scans import Cases, moved, read_views
 from record_scanner import residuals
+from recordings import record, save_recording
 from scipy.stats import chi2
 
 from amrepair.align import align
@@ -37,7 +38,7 @@ from amrepair.errors import AmrepairError
 from amrepair.frames import Transform, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import RegionOptions
-from amrepair.simulate.recording import Recording, load_recording, record, save_recording
+from amrepair.simulate.recording import Recording, load_recording
 from amrepair.template import open_template
 from amrepair.template.port import Template
 

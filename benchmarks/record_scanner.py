@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 from noise_figures import NoiseFigures, noise_figures
 from real_scans import Placed, Surface, closed_surface, read_views, unfollowed
+from recordings import ViewResiduals, record, save_recording
 from scipy.spatial import cKDTree
 
-from amrepair.simulate.recording import Recording, ViewResiduals, record, save_recording
+from amrepair.simulate.recording import Recording
 from amrepair.simulate.replay import Replay
 
 OTHERS, NEAR_MM = 2, 1.0

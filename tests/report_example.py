@@ -155,7 +155,6 @@ def look(label: str, count: int, *, broken: bool, seed: int) -> ReportLook:
         threshold_mm=THRESHOLD_MM,
         smallest_mm=((5.0, 0.4), (21.0, 0.3)),
         noise="One point is off by 0.03 mm.",
-        threshold_source="4 sigma",
         normals=scene.normals if seed % 2 else None,
         unseen_mm=below[0][below[1][:, 2] < -0.5],
         missing=mesh_of(pocket()) if broken else None,
@@ -163,7 +162,6 @@ def look(label: str, count: int, *, broken: bool, seed: int) -> ReportLook:
         beads=BeadPath.from_toolpath(patch()) if broken else None,
         missing_mm3=POCKET_MM3 if broken else 1.9,
         excess_mm3=float(blob().volume()),
-        unseen_area_mm2=118.0,
         height_map=heights(broken=broken),
         outlines_mm=(corners,) if broken else (),
     )

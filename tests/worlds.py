@@ -40,11 +40,18 @@ class Difference:
 
     def thicker_than(self, length_mm: float) -> Difference:
         """Only where it is taller than `length_mm`: what a bead could fill."""
-        return Difference(self.missing.thicker_than(length_mm), self.excess.thicker_than(length_mm))
+        return Difference(*(_thicker(one, length_mm) for one in (self.missing, self.excess)))
 
     def filled_mm3(self, world: World) -> float:
         """Volume that was missing then and is solid in `world` now."""
         return self.missing.common(world.snapshot(self.missing.window)).volume_mm3
+
+
+def _thicker(solid: IntervalMap, length_mm: float) -> IntervalMap:
+    """Only the intervals longer than `length_mm`."""
+    keep = solid.spans_mm[:, 1] - solid.spans_mm[:, 0] > length_mm
+    before = np.concatenate([[0], np.cumsum(keep)])
+    return IntervalMap(solid.window, before[solid.offsets], solid.spans_mm[keep])
 
 
 def missing_versus(world: World, reference: World) -> Difference:

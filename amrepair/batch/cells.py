@@ -102,11 +102,6 @@ class CellSums:
         """(k,) one of the sums."""
         return self.table[:, CELL_COLUMNS.index(name)]
 
-    def mean_mm(self) -> Float[np.ndarray, " k"]:
-        """(k,) mean deviation, mm; NaN where no scan saw the cell."""
-        seen = self.column("seen")
-        return np.where(seen > 0, UNIT_MM * self.column("deviation") / np.maximum(seen, 1), np.nan)
-
     def volume_mm3(self, name: str) -> Float[np.ndarray, " k"]:
         """(k,) volume of all scans together, mm³: `missing` or `excess`."""
         return UNIT_MM3 * self.column(f"{name}_mm3")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Box, PlanePoints, Values
-from amrepair.loop.layer_level import FLOW_TEST, FlowOptions, LayerLevel, lie_off
+from amrepair.loop.layer_level import LayerLevel, lie_off
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Finding, judge
@@ -122,7 +122,6 @@ def findings(
     layer_index: int | None,
     line: int,
     seen_twice: bool = False,
-    flow_test: FlowOptions = FLOW_TEST,
     objects: Objects | None = None,
 ) -> tuple[Finding, ...]:
     """The facts about every region of a plan.
@@ -133,8 +132,6 @@ def findings(
         The layer just finished (None: the finished part), and the job's next line.
     seen_twice
         Whether this stop was looked at before, nothing printed between.
-    flow_test
-        What it takes to change the next layer's flow.
     objects
         The job's, where it is printed on without those that cannot be repaired.
     """
@@ -145,7 +142,7 @@ def findings(
     regions = plan.deficit.regions
     z_mm = None if layer_index is None else job.layers[layer_index].z_mm
     owners = _owners(objects, regions, line)
-    off = lie_off(LayerLevel.of(plan, z_mm, flow_test) if regions else None, regions)
+    off = lie_off(LayerLevel.of(plan, z_mm) if regions else None, regions)
     for region, whole_mm3, is_off, owner in zip(
         regions, _whole_defects(regions, plan.policy), off, owners, strict=True
     ):

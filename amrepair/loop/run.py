@@ -61,13 +61,17 @@ def run_loop(
 
     Examples
     --------
-    A printer that is a file, and a scanner that is one: what would be sent lies in `sent.gcode`.
+    A printer that is a file, and a scanner that always reads one: what would be sent lies in
+    `sent.gcode`.
 
     >>> from pathlib import Path
     >>> import gcode
-    >>> from amrepair import Site, open_template, run_loop
+    >>> from amrepair import Site, Transform, open_template, read_scan, run_loop
     >>> from amrepair.loop import locate_part, plan_stops
-    >>> from amrepair.scans import FileScanner
+    >>> class Reader:
+    ...     build_from_scanner = Transform.identity("build", "scanner")
+    ...     def scan(self, request):
+    ...         return read_scan(Path("scan.ply"), frame="scanner")
     >>> setup, template = gcode.load_setup(), open_template(Path("part.safetensors"))
     >>> job = gcode.read_job(Path("job.gcode").read_text(), dialect="prusa")
     >>> placed = locate_part(job, template, layer_height_mm=0.2)
@@ -77,7 +81,7 @@ def run_loop(
     ...     job,
     ...     gcode.check_program(job.program, setup),
     ...     printer,
-    ...     FileScanner(Path("scan.ply")),
+    ...     Reader(),
     ...     lambda stop: Site.of_part(template, setup, build_from_template=placed),
     ...     stops=plan_stops(job, []),
     ... )

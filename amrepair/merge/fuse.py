@@ -74,8 +74,8 @@ class Fused:
         None where one scan alone was given.
     standard_error_mm
         99th percentile over the surface of the mean's own uncertainty.
-    unseen_ratio, single_ratio, overruled_ratio
-        Shares of the surface that no scan, or one alone, saw, and where a scan was overruled.
+    unseen_ratio, single_ratio
+        Shares of the surface that no scan, or one alone, saw.
     rejected
         Points that other scans contradict.
     outvoted_mm2
@@ -91,7 +91,6 @@ class Fused:
     standard_error_mm: float
     unseen_ratio: float
     single_ratio: float
-    overruled_ratio: float
     rejected: int
     outvoted_mm2: Float[np.ndarray, " scans"]
     outvoted_at_mm: Float[np.ndarray, "scans 3"]
@@ -142,7 +141,6 @@ def fuse(cloud: Cloud, options: FuseOptions = USUAL_FUSE) -> Fused:
         standard_error_mm=_standard_error(cloud, spread, radius_mm),
         unseen_ratio=coverage.unseen_mm2 / float(mesh.area),
         single_ratio=float((heard[close] == 1).mean()) if close.any() else 1.0,
-        overruled_ratio=float((overruled[close] > 0).mean()) if close.any() else 0.0,
         rejected=int((~keep).sum()),
         outvoted_mm2=area_mm2,
         outvoted_at_mm=at_mm,

@@ -16,7 +16,6 @@ from amrepair.policy.table import (
     decide,
     gravest,
     judge,
-    tables,
 )
 
 __all__ = [
@@ -32,5 +31,4 @@ __all__ = [
     "decide",
     "gravest",
     "judge",
-    "tables",
 ]  # fmt: skip

@@ -419,18 +419,6 @@ def decide(
     return Decision(row.action, row.id, row.reason, situation, tuple(verdicts))
 
 
-def tables() -> str:
-    """Both tables as they stand in the documentation."""
-    parts = []
-    for title, rows in (("What is done about a finding", FINDINGS), ("At the stop", STOP_ROWS)):
-        lines = [f"### {title}", "", "| row | when | decision | because |", "|---|---|---|---|"]
-        for row in rows:
-            when = ", ".join(str(condition) for condition in row.when) or "otherwise"
-            lines.append(f"| {row.id} | {when} | {row.action} | {row.reason} |")
-        parts.append("\n".join(lines))
-    return "\n\n".join(parts) + "\n"
-
-
 def _plain(value: Any) -> Any:
     if isinstance(value, StrEnum):
         return str(value)

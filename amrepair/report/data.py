@@ -236,7 +236,7 @@ class ReportLook:
     label_of_point
         (n,) 0 ok, 1 missing, 2 excess (`detect.Label`).
     threshold_mm
-        The limit that the detection used, and in `threshold_source` how it was set.
+        The limit that the detection used.
     normals
         (n, 3) unit normals or None; they only shade the drawing.
     unseen_mm
@@ -268,7 +268,6 @@ class ReportLook:
     deviation_mm: Values
     label_of_point: Numbers
     threshold_mm: float
-    threshold_source: str = ""
     normals: Points | None = None
     unseen_mm: Float[np.ndarray, "u 3"] | None = None
     missing: SolidMesh | None = None
@@ -277,7 +276,6 @@ class ReportLook:
     left: tuple[LeftPart, ...] = ()
     missing_mm3: float = 0.0
     excess_mm3: float = 0.0
-    unseen_area_mm2: float = 0.0
     height_map: HeightField | None = None
     outlines_mm: tuple[Float[np.ndarray, "_ 2"], ...] = ()
     stop: str = ""

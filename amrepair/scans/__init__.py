@@ -3,7 +3,7 @@
 This room reads files and sensors into `Scan`; it does not align, clean or judge.
 """
 
-from amrepair.scans.files import FileScanner, WatchedFolderScanner
+from amrepair.scans.files import WatchedFolderScanner
 from amrepair.scans.ply import write_ply
 from amrepair.scans.range_grid import EDGE, FLYING, EdgeOptions, RangeGrid, edge_flags
 from amrepair.scans.readers import read_height_map, read_scan
@@ -15,7 +15,6 @@ __all__ = [
     "FLYING",
     "PROBE",
     "EdgeOptions",
-    "FileScanner",
     "RangeGrid",
     "Scan",
     "ScanRequest",

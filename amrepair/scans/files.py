@@ -1,7 +1,7 @@
-"""Scanners that are files: one file, or a folder into which a real scanner drops its files.
+"""A scanner that is a folder, into which a real scanner drops its files.
 
-They wait, tell a whole file from a partial one, and refuse stale and repeated scans. They do
-not drive hardware.
+It waits, tells a whole file from a partial one, and refuses stale and repeated scans. It does not
+drive hardware.
 """
 
 from __future__ import annotations
@@ -24,42 +24,6 @@ _log = logging.getLogger(__name__)
 
 SCAN_SUFFIXES = POINT_SUFFIXES | MESH_SUFFIXES | HEIGHT_SUFFIXES
 LAYER_IN_NAME = re.compile(r"layer[-_ ]?(\d+)", re.IGNORECASE)
-
-
-class FileScanner:
-    """A `Scanner` that answers every request with one file.
-
-    Parameters
-    ----------
-    path
-        The scan.
-    build_from_scanner
-        Pose of the file's frame; identity (the file is in the build frame) by default.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        build_from_scanner: Transform | None = None,
-        sigma_mm: float | None = None,
-        sensor_at: Sequence[float] | None = None,
-    ) -> None:
-        self._path = path
-        self._pose = build_from_scanner or Transform.identity("build", "scanner")
-        self._sigma_mm = sigma_mm
-        self._sensor_at = sensor_at
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """Calibrated pose."""
-        return self._pose
-
-    def scan(self, request: ScanRequest) -> Scan:
-        """Read the file; `request` is not used, one file is all there is."""
-        return read_scan(
-            self._path, frame="scanner", sigma_mm=self._sigma_mm, sensor_at=self._sensor_at
-        )
 
 
 class WatchedFolderScanner:

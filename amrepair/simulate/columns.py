@@ -95,18 +95,11 @@ class IntervalMap:
         )
         return IntervalMap(self.window, offsets, spans)
 
-    def thicker_than(self, length_mm: float) -> IntervalMap:
-        """Only the intervals longer than `length_mm`."""
-        keep = self.spans_mm[:, 1] - self.spans_mm[:, 0] > length_mm
-        before = np.concatenate([[0], np.cumsum(keep)])
-        return IntervalMap(self.window, before[self.offsets], self.spans_mm[keep])
-
-    def thickness_mm(self, z_low_mm: float = -np.inf, z_high_mm: float = np.inf) -> HeightMap:
-        """(ny, nx) solid length of each column between two heights."""
-        lengths = kernels.column_lengths(
-            self.offsets, self.spans_mm, float(z_low_mm), float(z_high_mm)
-        )
-        return np.asarray(lengths).reshape(self.window.shape)
+    def thickness_mm(self) -> HeightMap:
+        """(ny, nx) solid length of each column."""
+        column = np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+        lengths = self.spans_mm[:, 1] - self.spans_mm[:, 0]
+        return np.bincount(column, lengths, len(self.offsets) - 1).reshape(self.window.shape)
 
     def top_mm(self) -> HeightMap:
         """(ny, nx) height of the highest solid; 0, the bed, where there is none."""

@@ -288,16 +288,6 @@ def intersect_flat(offsets_a, spans_a, offsets_b, spans_b):
 
 
 @njit(cache=True, nogil=True)
-def column_lengths(offsets, spans, z_low, z_high):
-    """(n,) solid length of each flat column between two heights."""
-    lengths = np.zeros(len(offsets) - 1)
-    for k in range(len(offsets) - 1):
-        for m in range(offsets[k], offsets[k + 1]):
-            lengths[k] += max(0.0, min(spans[m, 1], z_high) - max(spans[m, 0], z_low))
-    return lengths
-
-
-@njit(cache=True, nogil=True)
 def paired(offset, z):
     """Flat intervals of a closed surface from its crossings by column (`column_crossings`).
 

@@ -52,10 +52,6 @@ class World:
     middle_mm
         XY that the part shrinks towards and curls around, build frame; the bed's middle.
 
-    Attributes
-    ----------
-    lost_mm3
-        Plastic pushed out beyond the world.
     """
 
     def __init__(
@@ -117,11 +113,6 @@ class World:
     def cell_mm(self) -> float:
         """Edge of a column."""
         return self.columns.cell_mm
-
-    @property
-    def lost_mm3(self) -> float:
-        """Plastic pushed out beyond the world."""
-        return float(self._state[4]) * self.cell_mm**2
 
     @property
     def volume_mm3(self) -> float:

@@ -153,11 +153,6 @@ class FirmwareCore:
         self._out.clear()
         return data if self.wire is None else self.wire.to_host(data)
 
-    @property
-    def busy(self) -> bool:
-        """Whether a command is under way or lines wait."""
-        return self.machine.wait is not None or b"\n" in self._rx
-
     # ------------------------------------------------------------------ lines
 
     def _line(self, raw: bytes) -> None:

@@ -378,10 +378,6 @@ class Journal:
         """Return the remarks, oldest first."""
         return tuple(row[0] for row in self._run("SELECT text FROM note ORDER BY rowid"))
 
-    def check(self) -> bool:
-        """Whether SQLite finds the file whole."""
-        return bool(self._run("PRAGMA integrity_check").fetchone()[0] == "ok")
-
     def close(self) -> None:
         """Close the file."""
         if self._disk is not None:

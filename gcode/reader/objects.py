@@ -41,10 +41,6 @@ class JobObjects:
     marks: str
     of_bead: Int[np.ndarray, " n"]
 
-    def box_mm(self, job: Job, index: int) -> tuple[float, float, float, float]:
-        """(x_min, y_min, x_max, y_max) of an object's beads, build frame."""
-        return box_of_beads_mm(job, self.of_bead == index)
-
     def own(self, names: Sequence[str]) -> Bool[np.ndarray, " n"]:
         """(n,) which of the job's beads are of some objects."""
         return np.isin(self.of_bead, [self.names.index(name) for name in names])

@@ -13,6 +13,7 @@ import trimesh
 from amrepair.cli import main
 from gcode.profiles import load_printer
 from gcode.reader import job_for, objects_of
+from gcode.reader.objects import box_of_beads_mm
 
 SIZE_MM = (9.0, 9.0, 2.0)
 APART_MM = 16.0
@@ -61,7 +62,7 @@ def test_one_of_three_is_given_up_and_the_others_are_printed(
     # what is still missing is that one's: a block at most, and more than the defect took
     (truth,) = result["truth"]
     assert truth["missing_mm3"] < result["missing_mm3_after"] < float(np.prod(SIZE_MM))
-    x0, _, x1, _ = objects.box_mm(job, objects.names.index(lost))
+    x0, _, x1, _ = box_of_beads_mm(job, objects.own([lost]))
     for region in result["regions"]:
         (low, *_), (high, *_) = region["box_mm"]
         assert x0 - 1.0 < low < high < x1 + 1.0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +83,12 @@ class Bench:
         os.write(fd, b"".join(line + b"\n" for line in lines) + b"M118 done\n")
         until(lambda: self.record.read_text().endswith("M118 done\n"))
         os.close(fd)
+
+
+def is_whole(journal: Path) -> bool:
+    """Whether SQLite finds the file whole."""
+    with contextlib.closing(sqlite3.connect(journal)) as file:
+        return bool(file.execute("PRAGMA integrity_check").fetchone()[0] == "ok")
 
 
 def notes(journal: Path) -> bytes:

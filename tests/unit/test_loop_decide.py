@@ -20,7 +20,6 @@ from amrepair.policy.table import (
     decide,
     gravest,
     judge,
-    tables,
 )
 from amrepair.regions.anomaly import DefectType, Label, Region
 
@@ -122,6 +121,18 @@ def test_a_decision_goes_to_the_record_with_all_that_it_rests_on() -> None:
     assert said["findings"][0]["reachable_ratio"] == 0.9
     assert said["findings"][0]["row"] == "F14"
     assert said["findings"][0]["box_mm"] == [[0.0, 0.0, 1.0], [5.0, 5.0, 1.8]]
+
+
+def tables() -> str:
+    """Both tables as they stand in the documentation."""
+    parts = []
+    for title, rows in (("What is done about a finding", FINDINGS), ("At the stop", STOP_ROWS)):
+        lines = [f"### {title}", "", "| row | when | decision | because |", "|---|---|---|---|"]
+        for row in rows:
+            when = ", ".join(str(condition) for condition in row.when) or "otherwise"
+            lines.append(f"| {row.id} | {when} | {row.action} | {row.reason} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
 
 
 def test_the_page_has_the_tables_of_the_code(regenerate_golden: bool) -> None:

@@ -12,6 +12,7 @@ from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import objects_of, read_job
+from gcode.reader.objects import box_of_beads_mm
 from gcode.resumption import Resumption, resume_at
 
 HEAD = ["G28", "G90", "M83", "G1 X0 Y0 Z.2 F600"]
@@ -47,7 +48,7 @@ def test_each_bead_belongs_to_its_object(marks: str, end: str) -> None:
     assert found.marks == marks
     assert found.names == MARKS[marks][3]
     assert found.of_bead.tolist() == [-1, 0, 0, 1, 1, 0, 0, 1, 1]
-    assert found.box_mm(read, 1) == pytest.approx((20.0, 20.0, 29.0, 29.0))
+    assert box_of_beads_mm(read, found.of_bead == 1) == pytest.approx((20.0, 20.0, 29.0, 29.0))
 
 
 def test_a_job_without_marks_has_no_objects() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from amrepair.errors import InputError, ScannerError
-from amrepair.scans import FileScanner, Scan, ScanRequest, WatchedFolderScanner, write_ply
+from amrepair.scans import Scan, ScanRequest, WatchedFolderScanner, write_ply
 
 
 class Time:
@@ -120,12 +120,6 @@ def test_silence_is_an_error_of_the_link(tmp_path: Path) -> None:
 def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         WatchedFolderScanner(tmp_path / "gone")
-
-
-def test_file_scanner_reads_its_file(tmp_path: Path) -> None:
-    write_ply(make(5), tmp_path / "a.ply")
-    scan = FileScanner(tmp_path / "a.ply").scan(ScanRequest("final", None, 1.0))
-    assert np.array_equal(scan.points_mm, make(5).points_mm)
 
 
 def test_a_file_that_shrinks_and_comes_back_whole_is_taken_once(tmp_path: Path) -> None:

@@ -15,19 +15,16 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.parameters import ScannerModel, load_world
-from amrepair.simulate.recording import (
-    Recording,
-    ViewResiduals,
-    edge_distance_mm,
-    load_recording,
-    record,
-    save_recording,
-)
+from amrepair.simulate.recording import Recording, edge_distance_mm, load_recording
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner
 from amrepair.simulate.world import World
 
-FIGURES = Path(__file__).parents[2] / "benchmarks" / "noise_figures.py"
-noise_figures = run_path(str(FIGURES))["noise_figures"]
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+noise_figures = run_path(str(BENCHMARKS / "noise_figures.py"))["noise_figures"]
+MADE = run_path(str(BENCHMARKS / "recordings.py"))
+ViewResiduals, record, save_recording = (
+    MADE[name] for name in ("ViewResiduals", "record", "save_recording")
+)
 PITCH_MM = 0.5
 SIDE_MM, TOP_MM = 50.0, 6.0
 
