@@ -5,9 +5,7 @@ printer is a port of `gcode.hosts`. What is put into a job for it is `postproces
 OctoPrint itself is `octoprint`.
 """
 
-from amrepair.agent.screens import Button, KlipperScreens, OctoPrintTab, Screens
-from amrepair.agent.shipped import MACROS, UNIT, shipped
-from amrepair.agent.talk import Talk
+from amrepair.agent.shipped import MACROS, shipped
 
-__all__ = ["MACROS", "UNIT", "Button", "KlipperScreens", "OctoPrintTab", "Screens", "Talk",
+__all__ = ["MACROS",
            "shipped"]  # fmt: skip

@@ -1,7 +1,7 @@
 """Bench: data sets, metrics, baselines and the runner that compares methods by name."""
 
 from amrepair.bench.registry import BENCH_METHODS
-from amrepair.bench.runner import BenchReport, run_bench
+from amrepair.bench.runner import run_bench
 from amrepair.bench.synth import SynthOptions, synthesize
 
-__all__ = ["BENCH_METHODS", "BenchReport", "SynthOptions", "run_bench", "synthesize"]
+__all__ = ["BENCH_METHODS", "SynthOptions", "run_bench", "synthesize"]

@@ -7,7 +7,7 @@ run looked at again. It knows ports only, and draws nothing.
 from __future__ import annotations
 
 from amrepair.loop.locate import locate_part
-from amrepair.loop.looks import Look, LoopReport, Stop, left_well, plan_stops
+from amrepair.loop.looks import Look, LoopReport, Stop, plan_stops
 from amrepair.loop.options import Approval, LoopOptions, Records
 from amrepair.loop.run import run_loop
 from amrepair.loop.tape import Tape
@@ -23,7 +23,6 @@ __all__ = [
     "Records",
     "Stop",
     "Tape",
-    "left_well",
     "locate_part",
     "plan_stops",
     "run_loop",

@@ -6,14 +6,6 @@ It measures the scans' noise, places them on each other, fuses them, and hands t
 
 from amrepair.merge.fit import ScanFit, fit_from_scans
 from amrepair.merge.open_mesh import fit_mesh
-from amrepair.merge.options import MergeOptions
 from amrepair.merge.sound_scans import SoundFit, learn_from_scans
 
-__all__ = [
-    "MergeOptions",
-    "ScanFit",
-    "SoundFit",
-    "fit_from_scans",
-    "fit_mesh",
-    "learn_from_scans",
-]
+__all__ = ["ScanFit", "SoundFit", "fit_from_scans", "fit_mesh", "learn_from_scans"]

@@ -5,30 +5,6 @@ or reads a file. A recorded run is judged again by this room alone (`policy.agai
 """
 
 from amrepair.policy.options import USUAL_POLICY, PolicyOptions
-from amrepair.policy.table import (
-    FINDINGS,
-    STOP_ROWS,
-    Action,
-    Condition,
-    Decision,
-    Row,
-    Verdict,
-    decide,
-    gravest,
-    judge,
-)
+from amrepair.policy.table import Action, Decision, decide, gravest, judge
 
-__all__ = [
-    "FINDINGS",
-    "STOP_ROWS",
-    "USUAL_POLICY",
-    "Action",
-    "Condition",
-    "Decision",
-    "PolicyOptions",
-    "Row",
-    "Verdict",
-    "decide",
-    "gravest",
-    "judge",
-]  # fmt: skip
+__all__ = ["USUAL_POLICY", "Action", "Decision", "PolicyOptions", "decide", "gravest", "judge"]

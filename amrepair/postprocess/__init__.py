@@ -5,6 +5,6 @@ at nothing and repairs nothing: that is for whoever is told by the marks (`loop`
 """
 
 from amrepair.postprocess.mark import LooksAsked, Marked, mark
-from amrepair.postprocess.words import TARGETS, Target, target_of
+from amrepair.postprocess.words import TARGETS, target_of
 
-__all__ = ["TARGETS", "LooksAsked", "Marked", "Target", "mark", "target_of"]
+__all__ = ["TARGETS", "LooksAsked", "Marked", "mark", "target_of"]

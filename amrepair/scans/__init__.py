@@ -5,8 +5,8 @@ This room reads files and sensors into `Scan`; it does not align, clean or judge
 
 from amrepair.scans.files import WatchedFolderScanner
 from amrepair.scans.ply import write_ply
-from amrepair.scans.range_grid import EDGE, FLYING, EdgeOptions, RangeGrid, edge_flags
-from amrepair.scans.readers import read_height_map, read_scan
+from amrepair.scans.range_grid import EDGE, FLYING, RangeGrid
+from amrepair.scans.readers import read_scan
 from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import PROBE, Scanner, ScanRequest
 
@@ -14,14 +14,11 @@ __all__ = [
     "EDGE",
     "FLYING",
     "PROBE",
-    "EdgeOptions",
     "RangeGrid",
     "Scan",
     "ScanRequest",
     "Scanner",
     "WatchedFolderScanner",
-    "edge_flags",
-    "read_height_map",
     "read_scan",
     "write_ply",
 ]

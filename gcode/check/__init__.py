@@ -5,8 +5,8 @@ bead stands as it asks of `surfaces`, as the planner does: two guesses of one th
 Only `check` makes a `CheckedProgram`, and only that may be printed.
 """
 
-from gcode.check.checker import Verdict, check, find_refusals, judge, policy_of
-from gcode.check.findings import Policy, Refusal, Touch, Warned
+from gcode.check.checker import check, find_refusals, judge, policy_of
+from gcode.check.findings import Policy, Refusal, Touch
 from gcode.check.hanging import JobBridges
 from gcode.check.proof import CheckedProgram, CheckReport
 
@@ -17,8 +17,6 @@ __all__ = [
     "Policy",
     "Refusal",
     "Touch",
-    "Verdict",
-    "Warned",
     "check",
     "find_refusals",
     "judge",

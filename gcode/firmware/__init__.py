@@ -5,17 +5,9 @@ becomes of the plastic is not its business.
 """
 
 from gcode.firmware.core import FirmwareCore
-from gcode.firmware.faults import Fault, FaultScript, parse_faults
+from gcode.firmware.faults import parse_faults
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.process import EmulatedPrinterProcess
 from gcode.firmware.serve import serve_forever
 
-__all__ = [
-    "EmulatedPrinterProcess",
-    "Fault",
-    "FaultScript",
-    "FirmwareCore",
-    "MotionBatch",
-    "parse_faults",
-    "serve_forever",
-]
+__all__ = ["EmulatedPrinterProcess", "FirmwareCore", "MotionBatch", "parse_faults", "serve_forever"]

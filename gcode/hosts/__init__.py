@@ -5,23 +5,6 @@ make, judge or alter G-code.
 """
 
 from gcode.hosts.connect import connect
-from gcode.hosts.port import (
-    Capabilities,
-    LinkLostError,
-    PrintableProgram,
-    Printer,
-    PrintReport,
-    ResumeRefusedError,
-    Temperatures,
-)
+from gcode.hosts.port import LinkLostError, Printer, PrintReport, ResumeRefusedError
 
-__all__ = [
-    "Capabilities",
-    "LinkLostError",
-    "PrintReport",
-    "PrintableProgram",
-    "Printer",
-    "ResumeRefusedError",
-    "Temperatures",
-    "connect",
-]
+__all__ = ["LinkLostError", "PrintReport", "Printer", "ResumeRefusedError", "connect"]

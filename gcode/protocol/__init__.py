@@ -5,24 +5,21 @@ No I/O, no clock, no threads (h11 is the model). `hosts` gives it a port and a c
 
 from gcode.protocol.dialects import LINK_DIALECTS, LinkDialect
 from gcode.protocol.ledger import HISTORY_LINES
-from gcode.protocol.lines import WireLine, WireLines, checksum, command_in, wire_text
+from gcode.protocol.lines import WireLine, WireLines, checksum, command_in
 from gcode.protocol.link import PLAIN_OK, Link
 from gcode.protocol.timing import LinkTiming
-from gcode.protocol.transitions import TRANSITIONS, Signal, State
+from gcode.protocol.transitions import State
 
 __all__ = [
     "HISTORY_LINES",
     "LINK_DIALECTS",
     "PLAIN_OK",
-    "TRANSITIONS",
     "Link",
     "LinkDialect",
     "LinkTiming",
-    "Signal",
     "State",
     "WireLine",
     "WireLines",
     "checksum",
     "command_in",
-    "wire_text",
 ]

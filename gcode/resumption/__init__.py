@@ -4,20 +4,8 @@ It makes text and has it checked; it knows no printer's port and no journal (`ho
 with a job whose printer is still there).
 """
 
-from gcode.resumption.print_onto import Stacked, print_onto
-from gcode.resumption.rest import Rest, rest_without, without_beads
+from gcode.resumption.print_onto import print_onto
 from gcode.resumption.resume_at import Resumption, resume_at
-from gcode.resumption.touch import Touching, TouchOptions, plan_touch
+from gcode.resumption.touch import Touching, plan_touch
 
-__all__ = [
-    "Rest",
-    "Resumption",
-    "Stacked",
-    "TouchOptions",
-    "Touching",
-    "plan_touch",
-    "print_onto",
-    "rest_without",
-    "resume_at",
-    "without_beads",
-]
+__all__ = ["Resumption", "Touching", "plan_touch", "print_onto", "resume_at"]

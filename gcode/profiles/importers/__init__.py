@@ -22,7 +22,7 @@ from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
 from gcode.profiles.importers.macros import ends_homing, head_used, heads_of, macros_named
-from gcode.profiles.importers.rules import Imported, LeftOut, Mapped, Rule, Source, apply
+from gcode.profiles.importers.rules import Imported, LeftOut, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
 from gcode.profiles.names import Kind, list_profiles
@@ -31,16 +31,7 @@ from gcode.profiles.round_beds import kept_on
 from gcode.profiles.schema import PrinterProfile
 from gcode.profiles.store import MODELS, content_of
 
-__all__ = [
-    "Imported",
-    "ImportedFile",
-    "LeftOut",
-    "Mapped",
-    "import_job",
-    "import_profiles",
-    "to_toml",
-    "write_profiles",
-]
+__all__ = ["ImportedFile", "import_job", "import_profiles", "to_toml", "write_profiles"]
 
 _GENERIC = {
     "marlin": "generic_marlin",
