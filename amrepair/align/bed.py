@@ -59,8 +59,7 @@ def level_on_bed(
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     turn = rotation_from_vector(axis * (np.arcsin(min(1.0, float(np.linalg.norm(axis))))
                                         / max(float(np.linalg.norm(axis)), 1e-12)))  # fmt: skip
-    pivot = centre + np.array([0.0, 0.0, fit[2] - target.mean() + 0.0])
-    pivot[2] = low[2] + fit[2]
+    pivot = np.array([*centre[:2], low[2] + fit[2]])
     level = rigid(turn, pivot - turn @ pivot - np.array([0.0, 0.0, fit[2]]))
     return level @ matrix, True
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from amrepair.repair import Stopwatch
     from amrepair.report.folder import RunFolder
     from amrepair.scans import Scan
+    from amrepair.template.port import Template
 
 _POINT_COLOURS = ((180, 180, 180), (0, 90, 200), (220, 120, 0))  # ok, missing, excess
 
@@ -85,30 +86,17 @@ def align(
     with console.starting():
         import numpy as np
 
-        from amrepair.align import align as align_scan
         from amrepair.align.options import PAM_VARIANTS, USUAL_ALIGN
         from amrepair.repair import Stopwatch
         from amrepair.scans import write_ply
-        from amrepair.template import open_template
 
     settings = with_settings(PAM_VARIANTS, pam, "--pam")
     watch = Stopwatch()
     with bars.shown():
-        if template.is_dir():
-            known = from_library(cloud, template, method, seed, watch, bars)
-            found, chosen = known.registration, chosen_part(known)
-        else:
-            field, chosen = open_template(template, progress=bars), {}
-            with watch("align"):
-                found = align_scan(
-                    cloud,
-                    field,
-                    method=method,
-                    part_is_known=part_is_known,
-                    options=replace(USUAL_ALIGN, paper=settings),
-                    rng=np.random.default_rng(seed),
-                    progress=bars,
-                )
+        _, found, chosen = _laid(
+            cloud, template, method, seed, watch, bars,
+            part_is_known=part_is_known, options=replace(USUAL_ALIGN, paper=settings),
+        )  # fmt: skip
         if output is not None:
             moved = cloud.moved(found.template_from_scan)
             with bars.stage("write"):
@@ -133,6 +121,29 @@ def align(
         f"{len(found.symmetric_alternatives)} other poses fit as well."
     )
     console.out.print(np.array2string(found.template_from_scan.matrix, precision=6))
+
+
+def _laid(
+    cloud: Scan,
+    template: Path,
+    method: str,
+    seed: int,
+    watch: Stopwatch,
+    bars: console.Bars,
+    **how: Any,
+) -> tuple[Template, Registration, dict[str, Any]]:
+    """The template, or the one of a folder that a scan shows; where the scan lies; the choice."""
+    import numpy as np
+
+    from amrepair.align import align
+    from amrepair.template import open_template
+
+    if template.is_dir():
+        known = from_library(cloud, template, method, seed, watch, bars)
+        return known.template, known.registration, chosen_part(known)
+    field, rng = open_template(template, progress=bars), np.random.default_rng(seed)
+    with watch("align"):
+        return field, align(cloud, field, method=method, rng=rng, progress=bars, **how), {}
 
 
 def _pose_figures(found: Registration) -> dict[str, Any]:
@@ -212,7 +223,6 @@ def detect(
     with console.starting():
         import numpy as np
 
-        from amrepair.align import align as align_scan
         from amrepair.deficit import compute_deficit, measured_regions
         from amrepair.deficit.options import USUAL_DEFICIT
         from amrepair.frames import Transform
@@ -220,25 +230,13 @@ def detect(
         from amrepair.repair import Stopwatch
         from amrepair.report.collect import rounded
         from amrepair.report.folder import RunFolder
-        from amrepair.template import open_template
 
     watch = Stopwatch()
     with bars.shown():
         folder = RunFolder(out)
-        chosen: dict[str, Any] = {}
-        if template.is_dir():
-            known = from_library(cloud, template, "robust", seed, watch, bars)
-            field, found, chosen = known.template, known.registration, chosen_part(known)
-        else:
-            field = open_template(template, progress=bars)
-            with watch("align"):
-                found = align_scan(
-                    cloud,
-                    field,
-                    part_is_known=part_is_known,
-                    rng=np.random.default_rng(seed),
-                    progress=bars,
-                )
+        field, found, chosen = _laid(
+            cloud, template, "robust", seed, watch, bars, part_is_known=part_is_known
+        )
         placed = cloud.moved(found.template_from_scan)
         with watch("detect"):
             anomaly = detect_defects(placed, field, calibration=known_errors, progress=bars)

@@ -29,7 +29,7 @@ OLDEST_PYTHON = (3, 11)
 LEAST_DISK_MB = 200.0
 ENOUGH_DISK_MB = 1000.0
 # Compiled libraries: installed is not yet loadable.
-COMPILED = ("embreex", "manifold3d", "numba", "scipy", "shapely", "small_gicp", "kiss_matcher")
+COMPILED = ("manifold3d", "numba", "scipy", "shapely", "kiss_matcher")
 
 
 class State(StrEnum):

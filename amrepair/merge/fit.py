@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import amrepair
-from amrepair.arrays import Mask, Matrix, Points, Values
+from amrepair.arrays import Mask, Matrix, Points, Values, Vector
 from amrepair.errors import InputError
 from amrepair.frames import diagonal
 from amrepair.merge.cloud import outward_by, planes, spacing_of
@@ -42,8 +42,6 @@ class ScanFit:
         By number of a scan: why.
     outvoted
         By number of a scan: the mm² on which the others outvoted it.
-    notes
-        Sentences for the user.
     """
 
     template: GridSdf
@@ -53,25 +51,34 @@ class ScanFit:
     rmse_mm: float
     left_out: Mapping[int, str]
     outvoted: Mapping[int, float]
-    notes: tuple[str, ...]
 
     def as_json(self, scans: Sequence[str]) -> dict[str, Any]:
         """What `template fit --json` prints of it."""
         return {
-            "scans": [
-                {
-                    "file": name,
-                    "pose": None if pose is None else pose.tolist(),
-                    "left_out": self.left_out.get(k),
-                    "outvoted_mm2": self.outvoted.get(k, 0.0),
-                }
-                for k, (name, pose) in enumerate(zip(scans, self.poses, strict=True))
-            ],
+            "scans": rows_of_scans(scans, self.poses, self.left_out, self.outvoted),
             "noise_mm": self.sigma_mm,
             "rmse_mm": self.rmse_mm,
             "unseen_mm2": self.fused.coverage.unseen_mm2,
             "unseen_ratio": self.fused.unseen_ratio,
         }
+
+
+def rows_of_scans(
+    scans: Sequence[str],
+    poses: Sequence[Matrix | None],
+    left_out: Mapping[int, str],
+    outvoted: Mapping[int, float],
+) -> list[dict[str, Any]]:
+    """What became of each scan, for `--json`."""
+    return [
+        {
+            "file": name,
+            "pose": None if pose is None else pose.tolist(),
+            "left_out": left_out.get(k),
+            "outvoted_mm2": outvoted.get(k, 0.0),
+        }
+        for k, (name, pose) in enumerate(zip(scans, poses, strict=True))
+    ]
 
 
 def fit_from_scans(
@@ -126,7 +133,8 @@ def fit_from_scans(
         *(["the scans are taken as metres: as millimetres the part would be smaller than one"]
           if unit_mm != 1.0 else []),
         *_notes(scans, placed, fused, options),
-        *_said_outvoted(scans, fused, list(placed.poses), outvoted),
+        *(said_outvoted(scans[k], outvoted[k], at_mm)
+          for k, at_mm in zip(placed.poses, fused.outvoted_at_mm, strict=True) if k in outvoted),
         *_said_weak(scans, weak),
     )  # fmt: skip
     made = fit_fast(
@@ -144,7 +152,6 @@ def fit_from_scans(
         rmse_mm=placed.rmse_mm,
         left_out=placed.left_out,
         outvoted=outvoted,
-        notes=notes,
     )
 
 
@@ -292,19 +299,14 @@ def _notes(
     return notes
 
 
-def _said_outvoted(
-    scans: Sequence[Scan], fused: Fused, which: Sequence[int], outvoted: Mapping[int, float]
-) -> list[str]:
-    said = []
-    for place_, k in enumerate(which):
-        if k in outvoted:
-            x, y, z = fused.outvoted_at_mm[place_]
-            said.append(
-                f"{scans[k].source} differs from the others over {outvoted[k]:,.0f} mm² about "
-                f"({x:.1f}, {y:.1f}, {z:.1f}) mm (the template's frame) and was outvoted there: "
-                "look at that part, or that scan"
-            )
-    return said
+def said_outvoted(scan: Scan, area_mm2: float, at_mm: Vector) -> str:
+    """That the others outvoted a scan, over what area and where."""
+    x, y, z = at_mm
+    return (
+        f"{scan.source} differs from the others over {area_mm2:,.0f} mm² about "
+        f"({x:.1f}, {y:.1f}, {z:.1f}) mm (the template's frame) and was outvoted there: "
+        "look at that part, or that scan"
+    )
 
 
 def _said_weak(scans: Sequence[Scan], weak: Mapping[int, Slack]) -> list[str]:

@@ -12,6 +12,7 @@ from amrepair.align import align
 from amrepair.arrays import Matrix
 from amrepair.errors import AlignmentError
 from amrepair.frames import moved
+from amrepair.merge.fit import rows_of_scans, said_outvoted
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, MeshSdf
 from amrepair.template.fit import fit_fast
@@ -34,30 +35,20 @@ class SoundFit:
         (4, 4) template from scan, None for scans that do not fit the mesh.
     left_out
         By number of a scan: why.
-    notes
-        Sentences for the user.
     """
 
     template: LearnedSdf
     sound: SoundParts
     poses: tuple[Matrix | None, ...]
     left_out: dict[int, str]
-    notes: tuple[str, ...]
 
     def as_json(self, scans: Sequence[str]) -> dict[str, Any]:
         """What `template fit --json` prints of it."""
-        outvoted = iter(self.sound.outvoted_mm2.tolist())
+        laid = (k for k, pose in enumerate(self.poses) if pose is not None)
+        outvoted = dict(zip(laid, self.sound.outvoted_mm2.tolist(), strict=True))
         known = self.sound.scans > 0
         return {
-            "scans": [
-                {
-                    "file": name,
-                    "pose": None if pose is None else pose.tolist(),
-                    "left_out": self.left_out.get(k),
-                    "outvoted_mm2": 0.0 if pose is None else next(outvoted),
-                }
-                for k, (name, pose) in enumerate(zip(scans, self.poses, strict=True))
-            ],
+            "scans": rows_of_scans(scans, self.poses, self.left_out, outvoted),
             "offset_rms_mm": float(np.sqrt(np.mean(self.sound.offset_mm[known] ** 2))),
             "spread_median_mm": float(np.median(self.sound.spread_mm[known])),
             "learned_ratio": float(known.mean()),
@@ -111,7 +102,7 @@ def learn_from_scans(
     progress("learn from sound scans", 1.0, 1.0)
     notes = _notes(scans, laid, left_out, sound)
     learned = replace(learned, metadata={**learned.metadata, "notes": "; ".join(notes)})
-    return SoundFit(learned, sound, tuple(poses), left_out, notes)
+    return SoundFit(learned, sound, tuple(poses), left_out)
 
 
 def _notes(
@@ -132,10 +123,5 @@ def _notes(
         )
     for k, area_mm2, at_mm in zip(laid, sound.outvoted_mm2, sound.outvoted_at_mm, strict=True):
         if area_mm2 >= LEAST_TOLD_MM2:
-            x, y, z = at_mm
-            notes.append(
-                f"{scans[k].source} differs from the others over {area_mm2:,.0f} mm² about "
-                f"({x:.1f}, {y:.1f}, {z:.1f}) mm (the template's frame) and was outvoted there: "
-                "look at that part, or that scan"
-            )
+            notes.append(said_outvoted(scans[k], area_mm2, at_mm))
     return tuple(notes)

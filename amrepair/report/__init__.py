@@ -19,10 +19,9 @@ if TYPE_CHECKING:
         ReportLook,
         SolidMesh,
         TemperatureSeries,
-        regions_from_result,
     )
-    from amrepair.report.document import render_report, write_report
-    from amrepair.report.text import outcome_of, summary, summary_of, summary_of_result
+    from amrepair.report.document import write_report
+    from amrepair.report.text import outcome_of, summary, summary_of_result
 
 __all__ = [
     "BeadPath",
@@ -37,12 +36,9 @@ __all__ = [
     "TemperatureSeries",
     "outcome_of",
     "plan_is_enough",
-    "regions_from_result",
-    "render_report",
     "report_of_loop",
     "report_of_plan",
     "summary",
-    "summary_of",
     "summary_of_result",
     "write_report",
 ]
@@ -51,10 +47,10 @@ _HOMES = {
     "amrepair.report.assemble": "plan_is_enough, report_of_loop, report_of_plan",
     "amrepair.report.data": (
         "BeadPath, Counter, Figures, Outcome, RegionRow, ReportData, ReportDecision, "
-        "ReportLook, SolidMesh, TemperatureSeries, regions_from_result"
+        "ReportLook, SolidMesh, TemperatureSeries"
     ),
-    "amrepair.report.document": "render_report, write_report",
-    "amrepair.report.text": "outcome_of, summary, summary_of, summary_of_result",
+    "amrepair.report.document": "write_report",
+    "amrepair.report.text": "outcome_of, summary, summary_of_result",
 }
 
 __getattr__, __dir__ = lazy_names(globals(), _HOMES)

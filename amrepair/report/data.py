@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -284,6 +285,9 @@ class ReportLook:
     noise: str = ""
 
 
+MAY_BE_UNKNOWN = ("missing_mm3_after", "excess_mm3_after", "repaired_ratio")
+
+
 @dataclass(frozen=True, slots=True)
 class Figures:
     """The figures of a run that a person asks for first; None where they are not known."""
@@ -304,20 +308,9 @@ class Figures:
     @classmethod
     def from_result(cls, result: Mapping[str, object]) -> Figures:
         """The figures of a `--json` result of `simulate`, `repair` or `loop`."""
-        return cls(
-            missing_mm3_before=_number(result, "missing_mm3_before") or 0.0,
-            missing_mm3_after=_number(result, "missing_mm3_after"),
-            excess_mm3_before=_number(result, "excess_mm3_before") or 0.0,
-            excess_mm3_after=_number(result, "excess_mm3_after"),
-            repaired_ratio=_number(result, "repaired_ratio"),
-            unreachable_mm3=_number(result, "unreachable_mm3") or 0.0,
-            unseen_area_mm2=_number(result, "unseen_area_mm2") or 0.0,
-            iterations=int(_number(result, "iterations") or 0),
-            filament_mm=_number(result, "filament_mm") or 0.0,
-            print_time_s=_number(result, "print_time_s") or 0.0,
-            unprintable_mm3=_number(result, "unprintable_mm3") or 0.0,
-            covered_mm3=_number(result, "covered_mm3") or 0.0,
-        )
+        told: dict[str, Any] = {one.name: _number(result, one.name) for one in fields(cls)}
+        told |= {name: value or 0.0 for name, value in told.items() if name not in MAY_BE_UNKNOWN}
+        return cls(**told | {"iterations": int(told["iterations"])})
 
 
 @dataclass(frozen=True, slots=True)

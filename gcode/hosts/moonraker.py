@@ -27,10 +27,6 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
     files = "/server/files/gcodes"
     _aborted = False
 
-    def __enter__(self) -> MoonrakerPrinter:
-        self.connect()
-        return self
-
     def _new_session(self, reach: ServerReach) -> MoonrakerSession:
         return MoonrakerSession(reach)
 

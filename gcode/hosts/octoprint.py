@@ -30,10 +30,6 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     _capabilities: Capabilities | None = None
     _resends_before = 0
 
-    def __enter__(self) -> OctoPrintPrinter:
-        self.connect()
-        return self
-
     def _new_session(self, reach: ServerReach) -> OctoPrintSession:
         return OctoPrintSession(reach)
 

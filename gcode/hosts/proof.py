@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Callable
 
@@ -48,11 +47,9 @@ def require_checked(checked: object) -> None:
     LocalProtocolError
         Naming what was given instead.
     """
-    try:
-        proof: type = importlib.import_module("gcode.check").CheckedProgram
-    except ImportError:
-        proof = PrintableProgram
-    if not isinstance(checked, proof):
+    from gcode.check import CheckedProgram
+
+    if not isinstance(checked, CheckedProgram):
         raise LocalProtocolError(
             f"A printer takes a CheckedProgram, not a {type(checked).__name__}; run "
             f"gcode.check.check() on it first."

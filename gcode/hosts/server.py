@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Literal, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Literal, Protocol, Self, TypeVar, runtime_checkable
 
 import httpx
 
@@ -203,6 +203,10 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         self._tried_safety = False
         self._open: Session | None = None
         self._spent = ""  # the last part's file: it tells whoever comes after us how that ended
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
 
     def __exit__(
         self,

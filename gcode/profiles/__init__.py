@@ -21,9 +21,7 @@ from gcode.profiles.names import (
 if TYPE_CHECKING:
     from gcode.profiles.schema import (
         AxisLimits,
-        DialectName,
         EnvelopeSlice,
-        MaterialProfile,
         PrinterProfile,
         ProbeProfile,
         ProcessProfile,
@@ -36,9 +34,7 @@ __all__ = [
     "DEFAULT_PRINTER",
     "DEFAULT_PROCESS",
     "AxisLimits",
-    "DialectName",
     "EnvelopeSlice",
-    "MaterialProfile",
     "PrintSetup",
     "PrinterProfile",
     "ProbeProfile",
@@ -55,8 +51,7 @@ __all__ = [
 
 _HOMES = {
     "gcode.profiles.schema": (
-        "AxisLimits, DialectName, EnvelopeSlice, MaterialProfile, PrinterProfile, "
-        "ProbeProfile, ProcessProfile"
+        "AxisLimits, EnvelopeSlice, PrinterProfile, ProbeProfile, ProcessProfile"
     ),
     "gcode.profiles.setup": "PrintSetup, expand_script, load_setup",
     "gcode.profiles.store": "kind_of, load_material, load_printer, load_process",

@@ -37,6 +37,7 @@ from amrepair.report.data import ReportRule
 from amrepair.report.document import render_report
 from amrepair.report.live import COLOUR_STOPS
 from amrepair.report.options import USUAL_PAGE
+from amrepair.report.text import summary_of_result
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
 
@@ -204,6 +205,12 @@ def test_a_repair_that_leaves_something_is_headed_so() -> None:
     assert "does not mend all" in seen
     assert "29.7 mm³ can hold no bead" in seen
     assert "Left out" in seen
+
+
+def test_repairs_are_counted_in_whole_numbers() -> None:
+    result = {"missing_mm3_before": 3.0, "missing_mm3_after": 0.0, "filament_mm": 5.0,
+              "iterations": 2}  # fmt: skip
+    assert "over 2 repairs" in summary_of_result(result, within_tolerance=True)[1]
 
 
 # Machado, Oliveira and Fernandes (2009), severity 1.0, on linear RGB.

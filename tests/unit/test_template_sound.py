@@ -155,7 +155,7 @@ def test_scans_in_poses_of_their_own_are_laid_first_and_a_foreign_one_is_left_ou
     assert np.abs(fit.template.distance(high)).max() < 0.03
     said = fit.as_json([scan.source for scan in scans])
     assert [bool(row["left_out"]) for row in said["scans"]] == [False, False, False, True]
-    assert "learned from 3 of 4 scans" in fit.notes[0]
+    assert "learned from 3 of 4 scans" in fit.template.metadata["notes"]
 
 
 def test_scans_that_say_nothing_are_refused(drawn: GridSdf) -> None:
