@@ -162,53 +162,37 @@ class _Handler(BaseHTTPRequestHandler):
 
 def metrics(printers: Sequence[Mapping[str, Any]], history: Sequence[Mapping[str, Any]]) -> str:
     """Prometheus' text format."""
-    lines = [
-        "# HELP amrepair_printer_state Which state a printer is in (1) and which not (0).",
-        "# TYPE amrepair_printer_state gauge",
-    ]
-    for one in printers:
-        for state in RunState:
-            lines.append(
-                f'amrepair_printer_state{{printer="{_label(one["name"])}",state="{state}"}} '
-                f"{int(one['state'] == state)}"
-            )
-    lines += [
-        "# HELP amrepair_question_waiting Whether a printer waits for somebody's word.",
-        "# TYPE amrepair_question_waiting gauge",
-    ]
-    for one in printers:
-        waits = int(one["question"] is not None)
-        lines.append(f'amrepair_question_waiting{{printer="{_label(one["name"])}"}} {waits}')
-    lines += [
-        "# HELP amrepair_restarts_total How often a printer's process was started again.",
-        "# TYPE amrepair_restarts_total counter",
-    ]
-    for one in printers:
-        name = _label(one["name"])
-        lines.append(f'amrepair_restarts_total{{printer="{name}"}} {one["restarts"]}')
-    lines += [
-        "# HELP amrepair_judged_total Scans of the process that runs, by who detected.",
-        "# TYPE amrepair_judged_total counter",
-    ]
-    for one in printers:
-        for by in ("shared", "itself"):
-            labels = f'printer="{_label(one["name"])}",by="{by}"'
-            lines.append(f"amrepair_judged_total{{{labels}}} {one['judged'][by]}")
+    names = [(one, f'printer="{_label(one["name"])}"') for one in printers]
+    of_part = [(row, f'printer="{_label(row["printer"])}",part="{_label(row["part"])}"')
+               for row in history]  # fmt: skip
+    told = [
+        *_metric("printer_state", "gauge", "Which state a printer is in (1) and which not (0).",
+                 [(f'{name},state="{state}"', int(one["state"] == state))
+                  for one, name in names for state in RunState]),
+        *_metric("question_waiting", "gauge", "Whether a printer waits for somebody's word.",
+                 [(name, int(one["question"] is not None)) for one, name in names]),
+        *_metric("restarts_total", "counter", "How often a printer's process was started again.",
+                 [(name, one["restarts"]) for one, name in names]),
+        *_metric("judged_total", "counter", "Scans of the process that runs, by who detected.",
+                 [(f'{name},by="{by}"', one["judged"][by])
+                  for one, name in names for by in ("shared", "itself")]),
+    ]  # fmt: skip
     for column, what in (
         ("runs", "Runs begun"), ("looks", "Scans that were judged"),
         ("repairs", "Repairs that were printed"),
         ("missing_mm3", "Volume found missing at the first look of each stop, mm³"),
         ("excess_mm3", "Volume found too much at the first look of each stop, mm³"),
     ):  # fmt: skip
-        total = f"amrepair_{column}_total"
-        lines += [
-            f"# HELP {total} {what}.",
-            f"# TYPE {total} counter",
-        ]
-        for row in history:
-            labels = f'printer="{_label(row["printer"])}",part="{_label(row["part"])}"'
-            lines.append(f"{total}{{{labels}}} {row[column]:.10g}")
-    return "\n".join(lines) + "\n"
+        rows = [(name, f"{row[column]:.10g}") for row, name in of_part]
+        told += _metric(f"{column}_total", "counter", f"{what}.", rows)
+    return "\n".join(told) + "\n"
+
+
+def _metric(name: str, kind: str, what: str, rows: Sequence[tuple[str, object]]) -> list[str]:
+    """A figure's lines: labels and value by row."""
+    name = f"amrepair_{name}"
+    head = [f"# HELP {name} {what}", f"# TYPE {name} {kind}"]
+    return head + [f"{name}{{{labels}}} {value}" for labels, value in rows]
 
 
 def _label(text: str) -> str:

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from amrepair.errors import InputError
 from amrepair.simulate.recording import Recording, load_recording
+from gcode.errors import ProfileError
+from gcode.profiles.store import read_toml, validated
 
 SHIPPED = Path(__file__).with_name("world.toml")
 DEFAULT_SCANNER = "structured-light"
@@ -172,16 +172,7 @@ class ScannerModel(_Part):
     tilt_deg: Annotated[float, Field(ge=0, le=2)] = 0.05
 
 
-class _Content(_Part):
-    columns_mm: Annotated[float, Field(ge=0.02, le=0.15)]
-    bead: BeadModel
-    flow: FlowModel
-    thermal: ThermalModel
-    scanner: dict[str, ScannerModel]
-
-
-@dataclass(frozen=True, slots=True)
-class WorldParameters:
+class WorldParameters(_Part):
     """Everything that the simulated world is told.
 
     Attributes
@@ -189,17 +180,20 @@ class WorldParameters:
     columns_mm
         Edge of the world's columns.
     scanners
-        By name.
-    sha256
-        Of the content, defaults filled in.
+        By name; the file says `scanner.NAME`.
     """
 
-    columns_mm: float
+    columns_mm: Annotated[float, Field(ge=0.02, le=0.15)]
     bead: BeadModel
     flow: FlowModel
     thermal: ThermalModel
-    scanners: dict[str, ScannerModel]
-    sha256: str
+    scanners: dict[str, ScannerModel] = Field(alias="scanner")
+
+    @property
+    def sha256(self) -> str:
+        """Of the content, defaults filled in."""
+        told = json.dumps(self.model_dump(by_alias=True), sort_keys=True)
+        return hashlib.sha256(told.encode()).hexdigest()
 
     def scanner(self, name: str = DEFAULT_SCANNER) -> ScannerModel:
         """The scanner of a name; of `recorded:FILE` the default one with the file's noise.
@@ -244,38 +238,13 @@ def load_world(path: Path | None = None) -> WorldParameters:
     InputError
         If the file cannot be read, has an unknown key, or a value out of range.
     """
-    content = _toml(SHIPPED)
-    if path is not None:
-        content = _merged(content, _toml(path))
     try:
-        read = _Content.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        where = path or SHIPPED
-        if first["type"] == "extra_forbidden":
-            raise InputError(f"{where}: unknown key '{key}' = {first['input']!r}") from error
-        raise InputError(
-            f"{where}: key '{key}' = {first['input']!r} is out of range: {first['msg']}"
-        ) from error
-    told = json.dumps(read.model_dump(), sort_keys=True)
-    return WorldParameters(
-        read.columns_mm,
-        read.bead,
-        read.flow,
-        read.thermal,
-        read.scanner,
-        hashlib.sha256(told.encode()).hexdigest(),
-    )
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML ({error})") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the world cannot be read ({error})") from error
+        content = read_toml(SHIPPED)
+        if path is not None:
+            content = _merged(content, read_toml(path))
+        return validated(WorldParameters, content, path or SHIPPED)
+    except ProfileError as error:
+        raise InputError(f"{error}") from error
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

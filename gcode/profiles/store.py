@@ -24,6 +24,7 @@ _BEYOND = frozenset({"greater_than", "greater_than_equal", "less_than", "less_th
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 
 _P = TypeVar("_P", PrinterProfile, MaterialProfile, ProcessProfile)
+Model = TypeVar("Model", bound=BaseModel)
 
 
 MODELS: dict[Kind, type[BaseModel]] = {
@@ -71,7 +72,7 @@ def kind_of(id_or_path: str | Path) -> Kind:
             "is no profile; 'gcode profiles list' names them, a file of your own ends in .toml"
         )
         raise ProfileError(f"'{text}' {several if named else nothing}.")
-    own = _read(_find("printers", text))
+    own = read_toml(_find("printers", text))
     parent = Path(str(own.get("inherits", ""))).name.removesuffix(".toml")
     points = {
         kind: sum(key in model.model_fields for key in own) + (parent in list_profiles(kind))
@@ -131,7 +132,7 @@ def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
     if path in chain:
         loop = " → ".join(p.name for p in (*chain, path))
         raise ProfileError(f"{path}: `inherits` runs in a circle ({loop}); remove one link.")
-    own = _read(path)
+    own = read_toml(path)
     parent = own.pop("inherits", None)
     base: dict[str, Any] = {}
     if parent is not None:
@@ -150,23 +151,40 @@ def _resolve(kind: Kind, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
     return base
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """What a file itself says."""
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a file itself says.
+
+    Raises
+    ------
+    ProfileError
+        If it cannot be read, or is no TOML.
+    """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as e:
         raise ProfileError(f"{path}: not valid TOML ({e}).") from e
     except (OSError, UnicodeDecodeError) as e:
-        raise ProfileError(f"{path}: the profile cannot be read ({e}).") from e
+        raise ProfileError(f"{path}: it cannot be read ({e}).") from e
 
 
 def _validate(model: type[_P], content: dict[str, Any], path: Path) -> _P:
-    """The profile, or the first thing wrong with it: file, key, value, range."""
+    """The profile, or the first thing wrong with it."""
     digest = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
     if "sha256" in content:
         raise ProfileError(f"{path}: key 'sha256' is computed, not written; remove it.")
+    return validated(model, {**content, "sha256": digest}, path)
+
+
+def validated(model: type[Model], content: dict[str, Any], path: Path | str) -> Model:
+    """A file's content as a model of it.
+
+    Raises
+    ------
+    ProfileError
+        With the first thing that is wrong: file, key, value, range.
+    """
     try:
-        return model.model_validate({**content, "sha256": digest})
+        return model.model_validate(content)
     except ValidationError as e:
         first = e.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "(whole file)"
@@ -180,8 +198,9 @@ def _validate(model: type[_P], content: dict[str, Any], path: Path) -> _P:
             raise ProfileError(f"{path}: key '{key}' is missing{more}.") from e
         limits = _range(model, first["loc"])
         where = f"{path}: key '{key}' = {first['input']!r}"
-        if first["type"] in _BEYOND and limits:
-            raise ProfileError(f"{where} is out of range: it must be {limits}{more}.") from e
+        if first["type"] in _BEYOND:
+            told = f"it must be {limits}" if limits else first["msg"]
+            raise ProfileError(f"{where} is out of range: {told}{more}.") from e
         told = f"it must be {limits}; " if limits else ""
         raise ProfileError(f"{where} is not accepted: {told}{first['msg']}{more}.") from e
 

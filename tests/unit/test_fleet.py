@@ -49,17 +49,21 @@ def test_a_file_is_read_with_paths_beside_it(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("", "has no printer"),
-        ("x = [", "is no TOML"),
-        ("speed = 3\n[[printer]]\n" + ENTRY, "'speed' is unknown"),
-        ("[[printer]]\nname = 'a'", "printer 1: port is missing"),
-        ("[[printer]]\nname = 3", "name is 3; it is to be str"),
-        ("restarts = -1\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "restarts is -1"),
-        ("judges = -2\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "judges is -2"),
+        ("x = [", "not valid TOML"),
+        ("speed = 3\n[[printer]]\n" + ENTRY, "unknown key 'speed'"),
+        ("[[printer]]\nname = 'a'", "printer 1: key 'port' is missing"),
+        ("[[printer]]\nname = 3", "'name' = 3 is not accepted"),
+        ("restarts = -1\n[[printer]]\n" + ENTRY.format(name="a", port="b"),
+         "'restarts' = -1 is out of range: it must be at least 0"),
+        ("judges = -2\n[[printer]]\n" + ENTRY.format(name="a", port="b"),
+         "'judges' = -2 is out of range"),
         ("judged_within_s = 0\n[[printer]]\n" + ENTRY.format(name="a", port="b"),
-         "judged_within_s is 0; it must be more"),
-        ("within_s = nan\n[[printer]]\n" + ENTRY.format(name="a", port="b"), "within_s is nan"),
+         "'judged_within_s' = 0 is out of range: it must be more than 0"),
+        ("within_s = nan\n[[printer]]\n" + ENTRY.format(name="a", port="b"),
+         "'within_s' = nan is not accepted"),
         ("[[printer]]\n" + ENTRY.format(name="../a", port="b"), "becomes a folder"),
-        ("[[printer]]\n" + ENTRY.format(name="a", port="b") + "\napprove='yes'", "ask or auto"),
+        ("[[printer]]\n" + ENTRY.format(name="a", port="b") + "\napprove='yes'",
+         "should be 'ask' or 'auto'"),
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path: Path, text: str, said: str) -> None:
@@ -140,12 +144,16 @@ def fake(body: str | Callable[[PrinterSpec], str]) -> Command:
     return command
 
 
+def spec_of(name: str, **more: Any) -> PrinterSpec:
+    return PrinterSpec(name=name, port=f"/dev/{name}", scanner="watch:x", **more)
+
+
 def fleet_of(tmp_path: Path, names: str, command: Command, **options: Any) -> Fleet:
     specs = tuple(
-        PrinterSpec(name, f"/dev/{name}", "watch:x", Path("j.gcode"), Path("t.stl"))
-        for name in names.split()
+        spec_of(name, job=Path("j.gcode"), template=Path("t.stl")) for name in names.split()
     )
-    return Fleet(FleetConfig(FleetOptions(out=tmp_path / "out", **options), specs), command=command)
+    told = FleetOptions(out=tmp_path / "out", **options)
+    return Fleet(FleetConfig(options=told, printers=specs), command=command)
 
 
 @pytest.fixture
@@ -310,7 +318,7 @@ def test_the_command_of_a_printer_is_understood(tmp_path: Path) -> None:
 
     from amrepair.cli.app import app
 
-    spec = PrinterSpec("a", "/dev/a", "watch:x", Path("j"), Path("t"), every=3, at_layer=(4, 9))
+    spec = spec_of("a", job=Path("j"), template=Path("t"), every=3, at_layer=(4, 9))
     command = typer.main.get_command(app).commands["loop"]  # type: ignore[attr-defined]
     for going_on in (False, True):
         words = loop_command(spec, tmp_path, going_on)
