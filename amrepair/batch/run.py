@@ -81,6 +81,18 @@ class BatchReport:
         """Rows with a sentence instead of figures."""
         return sum(row["status"] != DONE for row in self.rows)
 
+    def to_json(self) -> dict[str, Any]:
+        """What it came to, for programs."""
+        return {
+            "scans": len(self.rows),
+            "refused": self.refused,
+            "computed": self.computed,
+            "known_before": self.known,
+            "repeated": self.repeated,
+            "cost": {name: round(value, 3) for name, value in self.cost.items()},
+            "notes": list(self.notes),
+        }
+
 
 @dataclass(slots=True)
 class _Books:
@@ -163,7 +175,10 @@ def run_batch(
                 progress("scans", float(_settled(books)), total)
         with _told_where_full(out, books, total):
             report = _written(place, entries, books, parts, options.kind, cost, progress)
-            _summary(place, report, executor, time.monotonic() - started_s)
+            wall_s = round(time.monotonic() - started_s, 3)
+            said = {**report.to_json(), "executor": executor, "wall_s": wall_s}
+            text = json.dumps(said, indent=2, ensure_ascii=False) + "\n"
+            place.write("batch.json", text.encode())
     return report
 
 
@@ -310,21 +325,6 @@ def _written(
         tuple(files),
         tuple(notes),
     )
-
-
-def _summary(place: ResultFolder, report: BatchReport, executor: str, wall_s: float) -> None:
-    said = {
-        "scans": len(report.rows),
-        "refused": report.refused,
-        "computed": report.computed,
-        "known_before": report.known,
-        "repeated": report.repeated,
-        "executor": executor,
-        "wall_s": round(wall_s, 3),
-        "cost": report.cost,
-        "notes": list(report.notes),
-    }
-    place.write("batch.json", (json.dumps(said, indent=2, ensure_ascii=False) + "\n").encode())
 
 
 @contextmanager

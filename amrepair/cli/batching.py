@@ -27,7 +27,7 @@ from gcode.process import one_thread
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
-    from amrepair.batch import BatchReport
+    pass
 
 batch_app = typer.Typer(
     help="Align, judge or repair many scans; a batch that was killed goes on.",
@@ -107,7 +107,8 @@ def _run(
     for note in report.notes:
         console.errors.print(note)
     if as_json:
-        console.show_json(_result(report, out))
+        files = [f"{out.rstrip('/')}/{name}" for name in report.files]
+        console.show_json({**report.to_json(), "files": files})
     else:
         console.out.print(
             f"{len(report.rows)} scans: {report.computed} judged now, {report.known} known before, "
@@ -207,16 +208,3 @@ def _places(sensor_at: list[str] | None) -> tuple[tuple[float, float, float], ..
     if placed := () if places is None else tuple(places.tolist()):
         return tuple((x, y, z) for x, y, z in placed)
     return ()
-
-
-def _result(report: BatchReport, out: str) -> dict[str, Any]:
-    return {
-        "scans": len(report.rows),
-        "refused": report.refused,
-        "computed": report.computed,
-        "known_before": report.known,
-        "repeated": report.repeated,
-        "cost": {name: round(value, 3) for name, value in report.cost.items()},
-        "notes": list(report.notes),
-        "files": [f"{out.rstrip('/')}/{name}" for name in report.files],
-    }

@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 def sort_inputs(paths: list[Path]) -> tuple[list[Path], list[Path]]:
     """Meshes and scans among a template's inputs; a PLY without faces is a scan."""
+    from gcode.clouds import is_ply_mesh
     from gcode.solids import SOLID_SUFFIXES
 
     meshes: list[Path] = []
     scans: list[Path] = []
     for path in paths:
-        is_mesh = path.suffix.lower() in SOLID_SUFFIXES and not is_cloud(path)
+        suffix = path.suffix.lower()
+        is_mesh = is_ply_mesh(path) if suffix == ".ply" else suffix in SOLID_SUFFIXES
         (meshes if is_mesh else scans).append(path)
     return meshes, scans
 
@@ -62,16 +64,6 @@ def refuse_traps(paths: list[Path]) -> None:
                 raise InputError(
                     f"the mesh {path} cannot be read as 3MF ({error}); export it again"
                 ) from error
-
-
-def is_cloud(path: Path) -> bool:
-    """Whether a file is a PLY whose header tells of no faces: a scan, not a mesh."""
-    if path.suffix.lower() != ".ply" or not path.is_file():
-        return False
-    with path.open("rb") as stream:
-        head = stream.read(4096).split(b"end_header")[0]
-    words = [line.split() for line in head.splitlines() if line.startswith(b"element face")]
-    return not any(len(word) == 3 and word[2] != b"0" for word in words)
 
 
 def write_mesh(mesh: Any, path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amrepair.cli.files import is_cloud, refuse_traps
+from amrepair.cli.files import refuse_traps, sort_inputs
 from amrepair.errors import InputError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
@@ -82,8 +82,6 @@ def shown_as(path: Path) -> Callable[[LiveView], None]:
     """Read a file, before any page is loaded; what puts it there."""
     import numpy as np
 
-    from gcode.solids import SOLID_SUFFIXES as MESH_SUFFIXES
-
     suffix, name = path.suffix.lower(), path.name
     if suffix in PROGRAM_SUFFIXES:
         from gcode.reader import read_job
@@ -95,7 +93,7 @@ def shown_as(path: Path) -> Callable[[LiveView], None]:
 
         solid = load_template(path).solid()
         return lambda page: page.show_solid(name, solid, _colour())
-    if suffix in MESH_SUFFIXES and not is_cloud(path):
+    if sort_inputs([path])[0]:
         from amrepair.template.mesh_file import load_mesh
 
         mesh = load_mesh(path)

@@ -109,14 +109,14 @@ def simulate(
         from amrepair.report.folder import RunFolder
         from amrepair.scans import PROBE
         from amrepair.simulate.parameters import load_world
-        from amrepair.simulate.part_files import bracket_path
+        from amrepair.simulate.part_files import part_path
         from amrepair.simulate.run import place_on_bed, prepare_run, simulate_run
 
     watch, bars = Stopwatch(), console.Bars()
     policy = PolicyOptions(most_passes=max_iterations)
     told = load_world(world)
     _ = setup.printer.feeler if scanner == PROBE else told.scanner(scanner)  # before any work
-    path = part or bracket_path()
+    path = part or part_path("bracket")
     mesh = scaled_mesh(path, scale, setup)
     ids = (printer, material, process)
     place_on_bed(np.asarray(mesh.bounds, dtype=np.float64), setup)  # refused before any work

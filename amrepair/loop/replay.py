@@ -47,11 +47,7 @@ class _TapeScanner:
     """The pose of the run's scanner; its scans come from the tape."""
 
     def __init__(self, pose: Transform) -> None:
-        self._pose = pose
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        return self._pose
+        self.build_from_scanner = pose
 
     def scan(self, request: ScanRequest) -> Scan:
         raise LoopError(f"the record has no scan for {request.label}")

@@ -11,7 +11,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -213,13 +213,8 @@ def _before_the_end(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [*before, {"event": ANEW}] if before and before[-1].get("event") == FELT else before
 
 
-def report_to_json(report: PrintReport) -> dict[str, Any]:
-    """A link's report as it stands on the tape."""
-    return asdict(report)
-
-
 def report_from_json(said: dict[str, Any]) -> PrintReport:
-    """The same, read back."""
+    """A link's report as it stands on the tape (`asdict`), read back."""
     known = {field.name for field in fields(PrintReport)}
     values = {key: value for key, value in said.items() if key in known}
     for key in ("round_trip_s", "warnings"):

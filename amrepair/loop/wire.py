@@ -7,11 +7,11 @@ It does not know why something is sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, Protocol, runtime_checkable
 
 from amrepair.errors import InputError, LoopError
-from amrepair.loop.tape import TOUCH, Sent, Tape, report_from_json, report_to_json
+from amrepair.loop.tape import TOUCH, Sent, Tape, report_from_json
 from gcode.check import CheckedProgram
 from gcode.hosts.port import Printer, PrintReport, TellsTouches
 from gcode.hosts.touching import felt
@@ -60,7 +60,7 @@ class Wire:
             report = self._printer.print(checked, lines=range(first, end), progress=progress)
         if report.ok:
             self._printer.finish_moves()
-            self._end(report=report_to_json(report))
+            self._end(report=asdict(report))
         return report
 
     def touch(self, checked: CheckedProgram, told: Callable[[], None]) -> list[float]:

@@ -26,6 +26,11 @@ class Operator:
         Called from the thread that presses the button: `Printer.pause` and `Printer.resume`.
     changed
         Called after every change, so that whoever draws can draw it.
+
+    Attributes
+    ----------
+    asked, paused
+        Whether a question waits for an answer, and whether the run rests.
     """
 
     def __init__(
@@ -37,39 +42,29 @@ class Operator:
     ) -> None:
         self.on_pause, self.on_resume, self.changed = on_pause, on_resume, changed
         self._state = threading.Condition()
-        self._asked = False
-        self._paused = False
+        self.asked = False
+        self.paused = False
         self._closed = False
         self._verdict: OperatorAnswer | None = None
-
-    @property
-    def asked(self) -> bool:
-        """Whether a question waits for an answer."""
-        return self._asked
-
-    @property
-    def paused(self) -> bool:
-        """Whether the run rests."""
-        return self._paused
 
     def ask(self) -> OperatorAnswer:
         """Wait until somebody decides; a view that is closed means skip."""
         with self._state:
-            self._asked, self._verdict = True, None
+            self.asked, self._verdict = True, None
         self.changed()
         with self._state:
             self._state.wait_for(
-                lambda: self._closed or (self._verdict is not None and not self._paused)
+                lambda: self._closed or (self._verdict is not None and not self.paused)
             )
             verdict = self._verdict or OperatorAnswer.SKIP
-            self._asked, self._verdict = False, None
+            self.asked, self._verdict = False, None
         self.changed()
         return verdict
 
     def decide(self, verdict: OperatorAnswer) -> bool:
         """Answer the question that waits; False where none does: a late click decides nothing."""
         with self._state:
-            if not self._asked or self._verdict is not None:
+            if not self.asked or self._verdict is not None:
                 return False
             self._verdict = verdict
             self._state.notify_all()
@@ -82,8 +77,8 @@ class Operator:
         part.
         """
         with self._state:
-            self._paused = not self._paused
-            resting = self._paused
+            self.paused = not self.paused
+            resting = self.paused
             self._state.notify_all()
         try:
             (self.on_pause if resting else self.on_resume)()
@@ -94,7 +89,7 @@ class Operator:
     def wait_while_paused(self) -> None:
         """Return at once, or when the pause ends."""
         with self._state:
-            self._state.wait_for(lambda: self._closed or not self._paused)
+            self._state.wait_for(lambda: self._closed or not self.paused)
 
     def close(self) -> None:
         """Nobody will answer any more."""

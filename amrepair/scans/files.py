@@ -60,18 +60,13 @@ class WatchedFolderScanner:
         if not folder.is_dir():
             raise InputError(f"{folder}: the watched folder does not exist; create it first")
         self._folder = folder
-        self._pose = build_from_scanner or Transform.identity("build", "scanner")
+        self.build_from_scanner = build_from_scanner or Transform.identity("build", "scanner")
         self._timeout_s, self._settle_s, self._poll_s = timeout_s, settle_s, poll_s
         self._sigma_mm, self._sensor_at, self._unit = sigma_mm, sensor_at, unit
         self._clock, self._sleep = clock, sleep
         self._done = {(p, *_stamp(p)) for p in self._files()}
         self._digests: set[bytes] = set()
         self._still_since: dict[Path, tuple[tuple[int, int], float]] = {}
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """Calibrated pose."""
-        return self._pose
 
     def scan(self, request: ScanRequest) -> Scan:
         """Wait for the next whole file that answers `request`.

@@ -171,22 +171,17 @@ class Columns:
         self.pool = np.empty((_FIRST_POOL, 2))
         self.pool_next = np.zeros(_FIRST_POOL, dtype=np.int32)
         self.meta = np.array([1, 0], dtype=np.int64)
-        self._touched = np.array([self.shape[0], -1, self.shape[1], -1], dtype=np.int64)
+        self.touched = np.array([self.shape[0], -1, self.shape[1], -1], dtype=np.int64)
 
     @property
     def arrays(self) -> tuple[Any, ...]:
         """The arrays in the order that the kernels take them."""
         return self.hi, self.lo, self.nxt, self.pool, self.pool_next, self.meta
 
-    @property
-    def touched(self) -> Any:
-        """(4,) rows and columns (y_first, y_last, x_first, x_last) where anything was laid."""
-        return self._touched
-
     def window(self, margin_mm: float = 0.0) -> Window:
         """The columns in use, and a margin around them."""
         pad = int(np.ceil(margin_mm / self.cell_mm))
-        y0, y1, x0, x1 = (int(value) for value in self._touched)
+        y0, y1, x0, x1 = (int(value) for value in self.touched)
         if y1 < 0:
             return Window(self.origin_mm, self.cell_mm, 0, 0, 0, 0)
         return Window(
@@ -246,16 +241,16 @@ class Columns:
         for target, source in ((twin.hi, self.hi), (twin.lo, self.lo), (twin.nxt, self.nxt)):
             target[rows, cols] = source[rows, cols]
         twin.pool, twin.pool_next = self.pool.copy(), self.pool_next.copy()
-        twin.meta, twin._touched = self.meta.copy(), self._touched.copy()
+        twin.meta, twin.touched = self.meta.copy(), self.touched.copy()
         return twin
 
     def touch(self, window: Window) -> None:
         """Note that a window may have been changed."""
         if window.shape[0] and window.shape[1]:
-            self._touched[0] = min(self._touched[0], window.y0)
-            self._touched[1] = max(self._touched[1], window.y1 - 1)
-            self._touched[2] = min(self._touched[2], window.x0)
-            self._touched[3] = max(self._touched[3], window.x1 - 1)
+            self.touched[0] = min(self.touched[0], window.y0)
+            self.touched[1] = max(self.touched[1], window.y1 - 1)
+            self.touched[2] = min(self.touched[2], window.x0)
+            self.touched[3] = max(self.touched[3], window.x1 - 1)
 
     def _merge(self, change: IntervalMap, *, subtract: bool) -> float:
         window = change.window

@@ -35,8 +35,3 @@ def part_path(name: str) -> Path:
     raise InputError(
         f"there is no example part named {name!r}; there are {', '.join(part_names()) or 'none'}"
     )
-
-
-def bracket_path() -> Path:
-    """Path of the default part: a bracket of 80×50×45 mm, 37 cm³."""
-    return part_path("bracket")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -165,7 +164,7 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
         console.errors.print(seen.told)
         cell_mm = max(AS_BUILT_CELL_MM, PIXELS_IN_CELL * seen.spacing_mm)
         return scanned.from_points(seen.points_mm, cell_mm, what=str(path))
-    if suffix in clouds.CLOUD_SUFFIXES and not (suffix == ".ply" and _has_faces(path)):
+    if suffix in clouds.CLOUD_SUFFIXES and not clouds.is_ply_mesh(path):
         return scanned.from_points(clouds.read_points(path), AS_BUILT_CELL_MM, what=str(path))
     if suffix not in SOLID_SUFFIXES:
         if not path.is_file():
@@ -177,13 +176,3 @@ def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> Height
         vertices, faces = read_triangles(path)
         return scanned.from_open_mesh(vertices, faces, AS_BUILT_CELL_MM, what=str(path))
     return HeightField.from_manifold(solid, AS_BUILT_CELL_MM, margin_mm=BESIDE_MESH_MM)
-
-
-def _has_faces(path: Path) -> bool:
-    """Whether a PLY is a mesh: its header names faces, and more than none."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(65536).partition(b"end_header")[0].decode("ascii", "replace")
-    except OSError:
-        return False
-    return re.search(r"^element face [1-9]", head, re.MULTILINE) is not None

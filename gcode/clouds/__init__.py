@@ -7,6 +7,7 @@ besides (normals, grids, sensors) is `amrepair.scans`'.
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,19 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
             "surface."
         )
     return points
+
+
+def is_ply_mesh(path: Path) -> bool:
+    """Whether a file is a PLY whose header names faces, and more than none."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(65536).partition(b"end_header")[0]
+    except OSError:  # whoever reads it says so
+        return False
+    return (
+        head.startswith(b"ply")
+        and re.search(rb"^element face [1-9]", head, re.MULTILINE) is not None
+    )
 
 
 def _places(data: bytes, path: Path) -> Float[np.ndarray, "n 3"]:

@@ -13,7 +13,7 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.scans import ScanRequest
 from amrepair.simulate.defects import PlacedDefect, parse_defect, place
-from amrepair.simulate.part_files import bracket_path, part_path
+from amrepair.simulate.part_files import part_path
 from amrepair.simulate.run import prepare_run
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner
 from amrepair.simulate.stage import Stage
@@ -130,7 +130,7 @@ def test_a_default_defect_without_room_is_left_out_and_said() -> None:
 
 
 def test_bracket_is_found_and_other_names_are_refused() -> None:
-    assert bracket_path().is_file()
+    assert part_path("bracket").is_file()
     with pytest.raises(InputError, match="bracket"):
         part_path("teapot")
 
