@@ -19,7 +19,6 @@ from amrepair.cli.live import (
     live_view,
 )
 from amrepair.cli.options import SeedOption, scaled_mesh
-from amrepair.errors import LoopError
 from amrepair.report.guarded import LOOPBACK
 from gcode.cli import console
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
@@ -102,6 +101,7 @@ def simulate(
     with console.starting():  # a second: what was typed wrong is refused before
         import numpy as np
 
+        from amrepair.cli.telling import exit_code_of
         from amrepair.loop import Approval
         from amrepair.policy import PolicyOptions
         from amrepair.repair import Stopwatch
@@ -167,10 +167,8 @@ def simulate(
         console.show_json(result)
     else:
         _say(run, result, folder, within)
-    if run.report.stopped:
-        raise typer.Exit(LoopError.exit_code)
-    if not within:
-        raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+    if code := exit_code_of(run.report):
+        raise typer.Exit(code)
 
 
 def _recorded(
@@ -205,14 +203,13 @@ def _recorded(
 def _result(
     run: SimulatedRun, folder: RunFolder, seed: int, seconds: dict[str, float]
 ) -> dict[str, Any]:
+    from amrepair.cli.telling import last_repair
     from amrepair.report.collect import loop_result, rounded
 
-    printed = [look for look in run.report.looks if look.printed]
-    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
     result = loop_result(
         run.report,
         repaired_ratio=run.repaired_ratio,
-        gcode=last,
+        gcode=last_repair(run.report, folder),
         seed=seed,
         seconds=seconds,
         setup=run.prepared.setup,

@@ -43,11 +43,10 @@ def written(
     """Result and report, in the run's folder; the result."""
     folder, setting, setup = begun.folder, begun.setting, begun.setup
     seconds = watch.rounded_s()
-    printed = [look for look in report.looks if look.printed]
-    last = str(folder.file(f"repair-{printed[-1].number}.gcode")) if printed else None
     result = loop_result(
-        report, repaired_ratio=None, gcode=last, seed=setting.seed, seconds=seconds, setup=setup
-    )
+        report, repaired_ratio=None, gcode=last_repair(report, folder),
+        seed=setting.seed, seconds=seconds, setup=setup,
+    )  # fmt: skip
     result |= warnings_json(begun.checked.report)
     if begun.felt:
         result["touches"] = [rounded(asdict(felt)) for felt in begun.felt]
@@ -89,6 +88,12 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
         )
     if code := exit_code_of(report):
         raise typer.Exit(code)
+
+
+def last_repair(report: LoopReport, folder: RunFolder) -> str | None:
+    """The file of the last repair that was printed."""
+    printed = [look.number for look in report.looks if look.printed]
+    return str(folder.file(f"repair-{printed[-1]}.gcode")) if printed else None
 
 
 def exit_code_of(report: LoopReport) -> int:

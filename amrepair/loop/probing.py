@@ -153,6 +153,8 @@ class ProbeScanner:
         What each look cost.
     """
 
+    build_from_scanner = Transform.identity("build", PROBE)  # the printer's own axes
+
     def __init__(
         self,
         feeler: Feeler,
@@ -175,11 +177,6 @@ class ProbeScanner:
         """Have the printer move by this wire from now on."""
         self._wire = wire
         self._feeler.send_by(wire)
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """The printer's own axes."""
-        return Transform.identity("build", PROBE)
 
     @property
     def _reach_mm(self) -> float:

@@ -51,7 +51,7 @@ class PrintedScanner:
         scanner: str,
         seed: int = 0,
     ) -> None:
-        model = told.scanner(scanner)
+        model, self.build_from_scanner = told.scanner(scanner), pose
         centre = printer.bed_middle_mm
         self.world = World.of(printer, told)
         rng = np.random.default_rng([seed, 2])
@@ -71,11 +71,6 @@ class PrintedScanner:
             model=model,
             recording=told.recording(scanner),
         )
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """Calibrated pose."""
-        return self._scanner.build_from_scanner
 
     def scan(self, request: ScanRequest) -> Scan:
         """Lay what was printed since the last look, then look; points in the scanner frame.

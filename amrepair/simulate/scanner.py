@@ -128,16 +128,11 @@ class SimulatedScanner:
         recording: Recording | None = None,
     ) -> None:
         self.world = world
-        self._pose = pose
+        self._pose, self.build_from_scanner = pose, pose.build_from_scanner_calibrated
         self._sensors_mm = np.array(sensors_mm, dtype=np.float64)
         self._rng = rng
         self.model = model or ScannerModel()
         self._replay = None if recording is None else Replay(recording)
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """Calibrated pose."""
-        return self._pose.build_from_scanner_calibrated
 
     def scan(self, request: ScanRequest) -> Scan:
         """Measure what stands on the bed now; points are in the scanner frame.

@@ -15,7 +15,6 @@ import numpy as np
 from scipy import ndimage
 
 from amrepair.arrays import ColumnMask
-from amrepair.frames import Transform
 from amrepair.loop.probing import ProbeScanner
 from amrepair.loop.wire import Wire
 from amrepair.scans import Scan, ScanRequest
@@ -90,11 +89,7 @@ class FeltStage:
         self, stage: Stage, probe: ProbeScanner, stand: Callable[[HeightField], None]
     ) -> None:
         self._stage, self._probe, self._stand = stage, probe, stand
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """The printer's own axes."""
-        return self._probe.build_from_scanner
+        self.build_from_scanner = probe.build_from_scanner
 
     def send_by(self, wire: Wire) -> None:
         """Have the printer move by this wire from now on."""
@@ -143,7 +138,7 @@ class Stage:
         self.world = world
         self.reference = world.copy()
         self._defects = tuple(defects)
-        self._scanner = scanner
+        self._scanner, self.build_from_scanner = scanner, scanner.build_from_scanner
         self._take_motion = take_motion
         self._box_mm = box_mm
         self._layer_height_mm = layer_height_mm
@@ -160,11 +155,6 @@ class Stage:
         self._wounds: list[_Wound] = []
         self._stops: list[str] = []
         self._printed = -1.0  # layers of the job, up to this one
-
-    @property
-    def build_from_scanner(self) -> Transform:
-        """Calibrated pose."""
-        return self._scanner.build_from_scanner
 
     @property
     def truth(self) -> tuple[DefectTruth, ...]:

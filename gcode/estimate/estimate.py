@@ -86,7 +86,7 @@ class _Taken:
             if printer is not None
             else (_PLAIN_SPEED, _PLAIN_ACCELERATION, _PLAIN_JERK)
         )
-        self._limits = _four(speed), _four(acceleration), _four(jerk)
+        self._limits = [np.array(one.xyze) for one in (speed, acceleration, jerk)]
         self._before = np.zeros(6)
         self._planned = np.zeros((4, lines))
         self._lines = 0
@@ -152,7 +152,3 @@ class _Taken:
             layers=len(layers),
             bounds_mm=(x0, y0, z0, x1, y1, z1),
         )
-
-
-def _four(limits: AxisLimits) -> np.ndarray:
-    return np.array([limits.x, limits.y, limits.z, limits.e], dtype=np.float64)

@@ -337,11 +337,7 @@ class Machine(Mechanics):
         self.quick_stop()
 
     def _m114(self, rest: bytes) -> None:
-        logical = [
-            native + offset
-            for native, offset in zip((self.x, self.y, self.z), self.offset, strict=True)
-        ]
-        self.replies.append(self.position_text(logical))
+        self.replies.append(self.position_text())
 
     def _m115(self, rest: bytes) -> None:
         line = self.variant.firmware_line.format(machine=self.profile.name)

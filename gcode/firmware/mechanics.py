@@ -17,7 +17,7 @@ from gcode.firmware.motion import MotionBatch
 from gcode.firmware.planner import Planner
 from gcode.firmware.thermal import BED_HEATER, HOTEND, Heater
 from gcode.firmware.variants import Variant
-from gcode.profiles import AxisLimits, PrinterProfile
+from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
 from gcode.units import mm_s_from_mm_min
 
@@ -134,9 +134,9 @@ class Mechanics:
     def _new_planner(self) -> Planner:
         profile = self.profile
         return Planner(
-            max_speed_mm_s=_axes(profile.max_speed_mm_s),
-            max_acceleration_mm_s2=_axes(profile.max_acceleration_mm_s2),
-            max_jerk_mm_s=_axes(profile.max_jerk_mm_s),
+            max_speed_mm_s=profile.max_speed_mm_s.xyze,
+            max_acceleration_mm_s2=profile.max_acceleration_mm_s2.xyze,
+            max_jerk_mm_s=profile.max_jerk_mm_s.xyze,
         )
 
     @property
@@ -319,18 +319,12 @@ class Mechanics:
             *(c for heater in heaters for c in (heater.temperature_c(now_s), heater.target_c))
         )
 
-    def position_text(self, logical: list[float] | None = None) -> str:
+    def position_text(self) -> str:
         """The text of a position report."""
-        x, y, z = logical or [
-            native + offset
-            for native, offset in zip((self.x, self.y, self.z), self.offset, strict=True)
-        ]
+        native = (self.x, self.y, self.z)
+        x, y, z = (place + off for place, off in zip(native, self.offset, strict=True))
         steps = f"X:{int(self.x * 80)} Y:{int(self.y * 80)} Z:{int(self.z * 400)}"
         return self.variant.place.format(x=x, y=y, z=z, e=self.e, steps=steps)
-
-
-def _axes(limits: AxisLimits) -> tuple[float, float, float, float]:
-    return limits.x, limits.y, limits.z, limits.e
 
 
 def words_of(rest: bytes) -> dict[str, float]:

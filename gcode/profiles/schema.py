@@ -47,6 +47,11 @@ class AxisLimits(_Strict):
     z: Positive
     e: Positive
 
+    @property
+    def xyze(self) -> tuple[float, float, float, float]:
+        """All four, in this order."""
+        return self.x, self.y, self.z, self.e
+
 
 class EnvelopeSlice(_Strict):
     """A height range of the tool head as a convex polygon around the nozzle's axis.
