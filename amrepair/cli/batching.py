@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from functools import wraps
 from inspect import Signature, signature
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
@@ -25,9 +25,6 @@ from gcode.cli import console
 from gcode.cli.options import JsonOption, MaterialOption, PrinterOption, ProcessOption
 from gcode.process import one_thread
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
-
-if TYPE_CHECKING:
-    pass
 
 batch_app = typer.Typer(
     help="Align, judge or repair many scans; a batch that was killed goes on.",

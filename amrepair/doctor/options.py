@@ -62,21 +62,28 @@ def options_classes() -> Iterator[type]:
 
 def _of(kind: Any) -> Iterator[Tunable]:
     reasons = _attributes(kind.__doc__ or "")
-    for field in dataclasses.fields(kind):
-        value: Any = field.default
-        make: Any = field.default_factory
-        if value is dataclasses.MISSING and make is dataclasses.MISSING:
-            continue  # it is given by whoever makes them, and has no value of its own
-        value = make() if value is dataclasses.MISSING else value
+    for name, value in _defaults(kind):
         if dataclasses.is_dataclass(value):
             continue  # options of another room, listed there
         yield Tunable(
             f"{kind.__module__}.{kind.__name__}",
-            field.name,
+            name,
             value if isinstance(value, (int, float, str, NoneType)) else str(value),
-            next((unit for end, unit in _NAME_UNITS if field.name.endswith(end)), ""),
-            reasons.get(field.name, ""),
+            next((unit for end, unit in _NAME_UNITS if name.endswith(end)), ""),
+            reasons.get(name, ""),
         )
+
+
+def _defaults(kind: Any) -> Iterator[tuple[str, Any]]:
+    """What has a value of its own, and is not given by whoever makes them."""
+    if not dataclasses.is_dataclass(kind):  # read from a file: a model of pydantic's
+        yield from kind.model_construct().model_dump().items()
+        return
+    for field in dataclasses.fields(kind):
+        if field.default is not dataclasses.MISSING:
+            yield field.name, field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            yield field.name, field.default_factory()
 
 
 def _attributes(doc: str) -> dict[str, str]:

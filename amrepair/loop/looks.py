@@ -111,11 +111,6 @@ class LoopReport:
         return {stop: tuple(looks) for stop, looks in found.items()}
 
     @property
-    def stops(self) -> tuple[Stop, ...]:
-        """Stops in order."""
-        return tuple(self.by_stop)
-
-    @property
     def first_looks(self) -> tuple[Look, ...]:
         """The first look of every stop."""
         return tuple(looks[0] for looks in self.by_stop.values())

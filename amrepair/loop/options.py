@@ -11,10 +11,10 @@ from amrepair.loop.pace import Pace
 from amrepair.loop.tape import Tape
 from amrepair.loop.wire import PickUp
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions
-from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.scans import Scan
+from gcode.profiles import ProcessProfile
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,8 @@ class LoopOptions:
     pace
         Looks besides the stops: more often after trouble, fewer while all is clean.
     limits
-        What may be printed without asking; beyond them the decision is `pause and ask`.
+        The process whose limits hold for what is printed without asking; beyond them the decision
+        is `pause and ask`.
     silent_stops
         So many stops in a row may be passed by where the scanner does not answer; the next such
         stop ends the run with its `ScannerError`. A scan that does not fit the part is taken once
@@ -44,7 +45,7 @@ class LoopOptions:
     policy: PolicyOptions = USUAL_POLICY
     kinds: KindOptions = USUAL_KINDS
     pace: Pace | None = None
-    limits: Limits | None = None
+    limits: ProcessProfile | None = None
     silent_stops: int = 0
     calibration: Calibration | None = None
     seed: int = 0

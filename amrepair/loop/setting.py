@@ -22,7 +22,6 @@ from amrepair.loop.marks import marked_stops
 from amrepair.loop.options import LoopOptions
 from amrepair.loop.pace import Pace
 from amrepair.policy import USUAL_POLICY, PolicyOptions
-from amrepair.policy.unasked import Limits
 from amrepair.regions.calibration import Calibration, as_tuples
 from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
@@ -125,7 +124,7 @@ class Setting:
         return LoopOptions(
             policy=self.policy,
             pace=Pace(self.adaptive) if self.adaptive else None,
-            limits=Limits.of(process) if self.limited else None,
+            limits=process if self.limited else None,
             calibration=self.scanners_errors,
             seed=self.seed,
         )

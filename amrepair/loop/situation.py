@@ -12,9 +12,10 @@ from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions, decide, gravest, judge
 from amrepair.policy.passes import is_little, is_stuck
 from amrepair.policy.table import Action, Situation
-from amrepair.policy.unasked import Limits
+from amrepair.policy.unasked import exceeded
 from amrepair.policy.worth import volume_mm3
 from amrepair.repair import RepairPlan, Site
+from gcode.profiles import ProcessProfile
 from gcode.reader import Job
 
 
@@ -26,7 +27,7 @@ def decide_look(
     here: Sequence[Look],
     *,
     seen_twice: bool,
-    limits: Limits | None,
+    limits: ProcessProfile | None,
     policy: PolicyOptions = USUAL_POLICY,
     objects: Objects | None = None,
 ) -> Decision:
@@ -37,7 +38,8 @@ def decide_look(
     here
         The earlier looks of this stop.
     limits
-        What may be printed unasked; None where somebody is asked, or all is allowed.
+        Whose limits hold for what is printed unasked; None where somebody is asked, or all is
+        allowed.
     objects
         The job's.
     """
@@ -85,11 +87,12 @@ def _done(looks: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> boo
     return is_little(looks[0].plan.deficit.missing_mm3, left_mm3, policy)
 
 
-def _beyond(plan: RepairPlan, limits: Limits) -> str:
+def _beyond(plan: RepairPlan, limits: ProcessProfile) -> str:
     """The first limit that a plan's program exceeds; empty if none."""
     if plan.checked is None or plan.patch is None or plan.estimate is None:
         return ""
-    return limits.exceeded(
+    return exceeded(
+        limits,
         missing_mm3=volume_mm3(plan.to_fill),
         print_time_s=plan.estimate.print_time_s,
         unreachable_mm3=plan.unreachable_mm3,

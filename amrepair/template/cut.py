@@ -6,7 +6,7 @@ f_k(x) = max(f(x), z − z_k): exact inside and on the surface, a lower bound ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,9 +14,6 @@ from jaxtyping import Float
 from amrepair.arrays import Box, Points, Values
 from amrepair.errors import TemplateError
 from amrepair.template.port import Template
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,7 +95,7 @@ def test_an_adaptive_run_looks_again_soon_and_is_replayed(small: Small, tmp_path
         folder, eye.scan, stops=stops, pace=Pace(6), tape=Tape(folder),
         look=RunFolder(folder).record,
     )  # fmt: skip
-    assert [stop.label for stop in report.stops] == [
+    assert [stop.label for stop in report.by_stop] == [
         "layer-005", "layer-006", "layer-008", "layer-012", "final",
     ]  # fmt: skip
     assert [look.printed for look in report.looks][:2] == [True, False]

@@ -12,7 +12,6 @@ from amrepair.errors import ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import Action, Tape
 from amrepair.loop.tape import read_events
-from amrepair.policy.unasked import Limits
 from amrepair.scans import Scan
 from gcode.moves import Program
 from gcode.reader import read_job
@@ -104,14 +103,16 @@ def test_somebody_may_say_go_on(small: Small, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "limits", [Limits(5.0, 1e4, 0.0), Limits(1e4, 1.0, 0.0), Limits(1e4, 1e4, 0.999)],
+    "limits", [(5.0, 1e4, 0.0), (1e4, 1.0, 0.0), (1e4, 1e4, 0.999)],
     ids=["volume", "time", "reach"],
 )  # fmt: skip
 def test_unasked_only_within_the_profile_s_limits(
-    small: Small, tmp_path: Path, limits: Limits
+    small: Small, tmp_path: Path, limits: tuple[float, float, float]
 ) -> None:
     pocket = small.block(-0.6, 0.5)
-    report, _ = small.run(tmp_path, lambda n: scan_of(small.standing - pocket), limits=limits)
+    names = ("unasked_max_mm3", "unasked_max_s", "unasked_min_reachable_ratio")
+    told = small.setup.process.model_copy(update=dict(zip(names, limits, strict=True)))
+    report, _ = small.run(tmp_path, lambda n: scan_of(small.standing - pocket), limits=told)
     assert report.stopped.startswith("pause and ask: ")
     assert "the profile" in report.stopped
     assert report.looks[0].decision.row == "S8"
@@ -123,7 +124,7 @@ def test_within_the_limits_it_prints_unasked(small: Small, tmp_path: Path) -> No
     report, _ = small.run(
         tmp_path,
         lambda n: scan_of(small.standing - pocket if n == 1 else small.standing),
-        limits=Limits.of(small.setup.process),
+        limits=small.setup.process,
     )
     assert not report.stopped
     assert [look.decision.action for look in report.looks] == [Action.FILL_NOW, Action.GO_ON]
