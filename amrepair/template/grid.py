@@ -191,6 +191,10 @@ class Coverage:
         found[rest] = to_guess <= np.abs(f_mm[rest])
         return np.asarray(found)
 
+    def to_guess_mm(self, points_mm: Points) -> Values:
+        """(n,) how far it is to surface that nobody saw, and that is a guess; inf without any."""
+        return np.asarray(self._trees[2].query(points_mm, workers=-1)[0], np.float64)
+
 
 def surface_elements(
     places_mm: Points, normals: Points, reach_mm: float
