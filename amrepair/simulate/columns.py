@@ -95,11 +95,11 @@ class IntervalMap:
         )
         return IntervalMap(self.window, offsets, spans)
 
-    def thickness_mm(self) -> HeightMap:
-        """(ny, nx) solid length of each column."""
+    def thickness_mm(self, z_low_mm: float = -np.inf, z_high_mm: float = np.inf) -> HeightMap:
+        """(ny, nx) solid length of each column between two heights."""
         column = np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
-        lengths = self.spans_mm[:, 1] - self.spans_mm[:, 0]
-        return np.bincount(column, lengths, len(self.offsets) - 1).reshape(self.window.shape)
+        low, high = np.clip(self.spans_mm, z_low_mm, z_high_mm).T
+        return np.bincount(column, high - low, len(self.offsets) - 1).reshape(self.window.shape)
 
     def top_mm(self) -> HeightMap:
         """(ny, nx) height of the highest solid; 0, the bed, where there is none."""
