@@ -99,7 +99,8 @@ class IntervalMap:
         """(ny, nx) solid length of each column between two heights."""
         column = np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
         low, high = np.clip(self.spans_mm, z_low_mm, z_high_mm).T
-        return np.bincount(column, high - low, len(self.offsets) - 1).reshape(self.window.shape)
+        length = np.bincount(column, high - low, len(self.offsets) - 1)
+        return length.astype(np.float64, copy=False).reshape(self.window.shape)  # ints of no spans
 
     def top_mm(self) -> HeightMap:
         """(ny, nx) height of the highest solid; 0, the bed, where there is none."""

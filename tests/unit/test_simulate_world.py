@@ -101,6 +101,15 @@ def test_lone_bead_lies_centred_on_its_path_wherever_the_grid_is(x_mm: float) ->
     assert solid.volume_mm3 == pytest.approx(20 * SECTION_MM2, rel=0.01)
 
 
+def test_an_empty_world_has_columns_of_no_length() -> None:
+    world = World((40.0, 30.0))
+    window = world.columns.box_window((10.0, 10.0), (12.0, 11.0))
+    thick = world.snapshot(window).thickness_mm()
+    assert thick.shape == window.shape
+    assert thick.dtype == np.float64
+    assert not thick.any()
+
+
 def test_under_extruded_bead_is_lower_and_hardly_narrower() -> None:
     heights, widths, sections = [], [], []
     for flow in (0.9, 0.5):
