@@ -160,7 +160,7 @@ def compute_deficit(
     """
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
-    evidence, lines = _evidence_of(template, anomaly, beads, options.skipped)
+    evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
     look = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
@@ -201,6 +201,7 @@ def compute_deficit(
 
 
 def _evidence_of(
+    scan: Scan,
     template: Template,
     anomaly: AnomalyMap,
     beads: PlannedBeads | None,
@@ -209,7 +210,7 @@ def _evidence_of(
     """What is known of space, also around lines of the job that are gone; and those lines."""
     evidence = anomaly.evidence
     assert evidence is not None
-    lines = None if beads is None else skipped(beads, evidence, template, options)
+    lines = None if beads is None else skipped(beads, scan, evidence, template, options)
     if lines is None or not len(lines.width_mm):
         return evidence, None
     labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)

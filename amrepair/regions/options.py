@@ -42,7 +42,9 @@ class SkippedOptions:
         Cells about a look that are asked for its line's top; how near to it, as a share of half a
         line.
     under_share
-        Of a line's width: as near under its middle nothing is seen where the line is.
+        Of a line's width: a ray that meets it so near to its middle ends there.
+    sunk_layers
+        So many layers over strands that hang lie lower by what strands hang lower: a skin's three.
     """
 
     look_step_mm: float = 0.25
@@ -68,6 +70,7 @@ class SkippedOptions:
     about: int = 6
     top_share: float = 1.0
     under_share: float = 0.25
+    sunk_layers: int = 3
 
 
 USUAL_SKIPPED = SkippedOptions()

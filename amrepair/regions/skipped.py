@@ -16,6 +16,7 @@ from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.as_built import SOLID_MM, Evidence
 from amrepair.frames import in_box, unit_vectors
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
+from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.stretches import in_turn, places_to_ends
 
@@ -79,6 +80,7 @@ class PlannedBeads:
 
 def skipped(
     beads: PlannedBeads,
+    scan: Scan,
     evidence: Evidence,
     template: Template,
     options: SkippedOptions = USUAL_SKIPPED,
@@ -89,8 +91,10 @@ def skipped(
     ----------
     beads
         What the job has laid last, template frame.
+    scan
+        In the template's frame, its sensors known; without rays nothing is said.
     evidence
-        Of a scan whose sensors are known; without rays nothing is said.
+        Of this scan.
     """
     paths = _Paths.of(beads, options)
     lines, line = paths.lines, paths.line
@@ -103,9 +107,12 @@ def skipped(
     rays_mm = evidence.rays_say(middle)
     ask = np.flatnonzero(rays_mm > 0)
     middle[ask] += _wall_shift(middle[ask], evidence, template, options)
+    middle[ask, 2] -= _sunk_mm(middle[ask], half_mm[ask], line[ask], lines, template, options)
     rays_mm[ask] = evidence.rays_say(middle[ask])
     ask = ask[rays_mm[ask] > 0]
-    by_surface, by_both = _shares(middle, half_mm, ask, rays_mm, paths, evidence, template, options)
+    by_surface, by_both = _shares(
+        middle, half_mm, ask, rays_mm, paths, scan, evidence, template, options
+    )
     surface_says = _together(by_surface, paths.path, options.looks_together)
     sure = surface_says >= options.gone_share
     both = _together(by_both, paths.path, options.looks_together)
@@ -261,20 +268,48 @@ def _wall_shift(
     return shift
 
 
+def _sunk_mm(
+    middle_mm: Points,
+    half_mm: Values,
+    line: Numbers,
+    lines: PlannedBeads,
+    template: Template,
+    options: SkippedOptions,
+) -> Values:
+    """How much lower than its layer each look's line lies because it was laid on strands.
+
+    What hangs is round: of its plastic some lies below its layer, and what is laid on it fills
+    the grooves between strands first. So the layers over a bridge or over lettering are all lower.
+    """
+    width_mm, height_mm = lines.width_mm[line], 2.0 * half_mm
+    lower_mm = 2.0 * np.sqrt(width_mm * height_mm / np.pi) - height_mm
+    low_mm = float(template.bounds_mm[0, 2])  # below lies the bed, or what nobody knows
+    sunk, rests = np.zeros(len(line), dtype=bool), np.zeros(len(line), dtype=bool)
+    for k in range(1, options.sunk_layers + 2):
+        below_mm = middle_mm.copy()
+        below_mm[:, 2] -= k * height_mm
+        void = (below_mm[:, 2] > low_mm) & (template.distance(below_mm) > 0)
+        sunk |= rests & void
+        rests |= ~void & (k == 1)
+    return np.where(sunk, np.clip(lower_mm, 0.0, half_mm), 0.0)
+
+
 def _shares(
     middle_mm: Points,
     half_mm: Values,
     ask: Int[np.ndarray, " a"],
     rays_mm: Values,
     paths: _Paths,
+    scan: Scan,
     evidence: Evidence,
     template: Template,
     options: SkippedOptions,
 ) -> tuple[Values, Values]:
     """(m,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
 
-    Where a line hangs, the floor below it is where it should be whether the line is there or not:
-    it says nothing, unless it was seen right under the line. What nobody looked into is there.
+    Where a line hangs, the floor below it is where it should be whether the line is there or not,
+    and planes and pixels are wider than the gaps beside it: there each ray tells for itself. What
+    nobody looked into is there.
     """
     by_surface = np.full(len(middle_mm), -1.0)
     by_both = by_surface.copy()
@@ -289,40 +324,58 @@ def _shares(
     below_mm = middle_mm[known] - 2.0 * half[:, None] * np.array([0.0, 0.0, 1.0])
     asked = np.flatnonzero(~topped & (surface < 0))
     asked = asked[template.distance(below_mm[asked]) > 0]
-    seen = _seen_below(middle_mm[known[asked]], half[asked], width_mm[asked], evidence, options)
-    surface[asked] = np.where(seen < 0, surface[asked], seen)
-    rays[asked] = np.minimum(rays[asked], 1.0)
+    went = _went_through(known[asked], middle_mm, half_mm, paths, scan, options)
+    told = np.flatnonzero(np.isfinite(went))
+    surface[asked[told]] = rays[asked[told]] = went[told]
     by_surface[known] = surface
     by_both[known] = np.where(topped, -1.0, 0.5 * (surface + rays))
     return by_surface, by_both
 
 
-def _seen_below(
+def _went_through(
+    which: Int[np.ndarray, " a"],
     middle_mm: Points,
     half_mm: Values,
-    width_mm: Values,
-    evidence: Evidence,
+    paths: _Paths,
+    scan: Scan,
     options: SkippedOptions,
-) -> Numbers:
-    """(m,) 1 where something was seen right under a line that would have hidden it, 0 where not.
+) -> Float[np.ndarray, " a"]:
+    """(a,) of the rays that met the core of a line how many more went on than ended: −1 to 1.
 
-    −1 where it was seen as high as the line, or as it hangs when it has sagged. Not deeper than
-    the line is wide: farther down, slanting rays get in past its side.
+    One that went on ended a line's height below its middle or deeper; what hangs lower than it
+    should is there. NaN where none came. A ray counts where it crosses the height of the line's
+    middle, however far aside the floor lies that it saw: between strands that hang apart slanting
+    rays see all of what is under them.
     """
-    found = np.zeros(len(middle_mm), dtype=np.int64)
-    place_mm = evidence.surfels.place_mm
-    low_mm = middle_mm[:, 2] - half_mm
-    place_mm = place_mm[place_mm[:, 2] > (low_mm - width_mm).min(initial=np.inf)]
-    near = cKDTree(place_mm[:, :2]).query_ball_point(
-        middle_mm[:, :2], options.under_share * width_mm
-    )
-    for k, others in enumerate(near):
-        under_mm = low_mm[k] - place_mm[others, 2]
-        if (under_mm < half_mm[k]).any():
-            found[k] = -1
-        elif (under_mm < width_mm[k]).any():
-            found[k] = 1
-    return found
+    assert scan.sensors_mm is not None
+    assert scan.sensor_index is not None
+    lines = paths.lines
+    over_mm = (lines.end_mm - lines.start_mm)[paths.line[which], :2]
+    along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
+    core_mm = options.under_share * lines.width_mm[paths.line[which]]
+    reach_mm = float(np.hypot(core_mm.max(initial=0.0), 0.5 * options.look_step_mm))
+    on, ended = np.zeros(len(which)), np.zeros(len(which))
+    height_mm = np.round(middle_mm[which, 2], 6)
+    for z_mm in np.unique(height_mm):
+        mine = np.flatnonzero(height_mm == z_mm)
+        place_mm, high_mm = middle_mm[which[mine]], 2.0 * half_mm[which[mine]]
+        met = np.flatnonzero(scan.points_mm[:, 2] < z_mm + high_mm.max())
+        points_mm = scan.points_mm[met]
+        way = scan.sensors_mm[scan.sensor_index[met]] - points_mm
+        back = (z_mm - points_mm[:, 2]) / np.maximum(way[:, 2], LEVEL)
+        crossing_mm = points_mm[:, :2] + back[:, None] * way[:, :2]
+        near = cKDTree(place_mm[:, :2]).query(crossing_mm, distance_upper_bound=reach_mm)[1]
+        came = np.flatnonzero((near < len(mine)) & (way[:, 2] > 0))
+        look = near[came]
+        off_mm = crossing_mm[came] - place_mm[look, :2]
+        x, y = along[mine[look]].T
+        in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[look]]
+        deep_mm = (z_mm - points_mm[came, 2]) / high_mm[look]
+        on += np.bincount(mine[look[in_core & (deep_mm > 1.0)]], minlength=len(which))
+        there = in_core & (np.abs(deep_mm) <= 1.0)
+        ended += np.bincount(mine[look[there]], minlength=len(which))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((on - ended) / (on + ended))
 
 
 def _topped(
