@@ -204,3 +204,22 @@ def look_up(
         across = max(cosine[r, c], flattest)
         best[i] = max(best[i], (seen - distance) * across)
         cautious[i] = max(cautious[i], (least[r, c] - distance) * across)
+
+
+@njit(cache=True, nogil=True)
+def crossings(points, index, sensors, height, top, corner, cell, marked):
+    """Points below `top` whose rays cross a height in marked cells, seen from above; and where."""
+    number, place = np.empty(len(points), np.int64), np.empty((len(points), 2))
+    found = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        sensor = sensors[index[i]]
+        if z >= top or sensor[2] <= z:
+            continue
+        back = (height - z) / (sensor[2] - z)
+        x, y = x + back * (sensor[0] - x), y + back * (sensor[1] - y)
+        u, v = int(np.floor((x - corner[0]) / cell)), int(np.floor((y - corner[1]) / cell))
+        if 0 <= u < marked.shape[0] and 0 <= v < marked.shape[1] and marked[u, v]:
+            number[found], place[found, 0], place[found, 1] = i, x, y
+            found += 1
+    return number[:found].copy(), place[:found].copy()

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from amrepair.arrays import Numbers, Points, Values
 from amrepair.frames import Transform, box_of, unit_vectors, ways_across
@@ -101,6 +101,32 @@ def clearances(
             image.least_mm, image.cosine, image.blend_mm, MIN_COSINE, best, least,
         )  # fmt: skip
     return best, least
+
+
+def rays_crossing(
+    scan: Scan,
+    near_mm: Float[np.ndarray, "a 2"],
+    within_mm: float,
+    height_mm: float,
+    top_mm: float,
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2"]]:
+    """Points below `top_mm` whose rays cross a height near some places; and where they do.
+
+    All that cross it within a distance of any of the places, as seen from above, and a few more.
+    None where the sensors are unknown.
+    """
+    if scan.sensors_mm is None or scan.sensor_index is None:
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+    corner = near_mm.min(axis=0) - 2.0 * within_mm
+    at = np.floor((near_mm - corner) / within_mm).astype(np.int64)
+    marked = np.zeros(at.max(axis=0) + 2, bool)
+    for x in range(-1, 2):
+        for y in range(-1, 2):
+            marked[at[:, 0] + x, at[:, 1] + y] = True
+    return kernels.crossings(
+        scan.points_mm, scan.sensor_index, scan.sensors_mm, height_mm, top_mm, corner, within_mm,
+        marked,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,10 @@ class SkippedOptions:
         deep, as far off as a part shrinks and no farther, and upright (cosine).
     wall_cells, least_wall_cells, beside_wall_mm, same_wall
         Of so many cells near a line those of the nearest wall (cosine), a few at least.
+    wall_share, wall_off_mm, shrinks_ratio
+        What one of all walls' cells is worth, as errors hang together along a wall, and what it
+        is off by as beads wander, where all of them tell how much the part is aside or has shrunk;
+        and by what share plastic shrinks: one standard deviation.
     about, top_share
         Cells about a look that are asked for its line's top; how near to it, as a share of half a
         line.
@@ -67,6 +71,9 @@ class SkippedOptions:
     least_wall_cells: int = 4
     beside_wall_mm: float = 1.5
     same_wall: float = 0.7
+    wall_share: float = 0.1
+    wall_off_mm: float = 0.1
+    shrinks_ratio: float = 0.003
     about: int = 6
     top_share: float = 1.0
     under_share: float = 0.25

@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.as_built import SOLID_MM, Evidence
-from amrepair.frames import in_box, unit_vectors
+from amrepair.frames import box_of, in_box, unit_vectors
+from amrepair.observe.rays import rays_crossing
+from amrepair.observe.robust import Problem, solve
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -107,11 +109,13 @@ def skipped(
     rays_mm = evidence.rays_say(middle)
     ask = np.flatnonzero(rays_mm > 0)
     middle[ask] += _wall_shift(middle[ask], evidence, template, options)
-    middle[ask, 2] -= _sunk_mm(middle[ask], half_mm[ask], line[ask], lines, template, options)
+    sunk_mm = np.zeros(len(line))
+    sunk_mm[ask] = _sunk_mm(middle[ask], half_mm[ask], line[ask], lines, template, options)
+    middle[:, 2] -= sunk_mm
     rays_mm[ask] = evidence.rays_say(middle[ask])
     ask = ask[rays_mm[ask] > 0]
     by_surface, by_both = _shares(
-        middle, half_mm, ask, rays_mm, paths, scan, evidence, template, options
+        middle, half_mm, ask, rays_mm, sunk_mm, paths, scan, evidence, template, options
     )
     surface_says = _together(by_surface, paths.path, options.looks_together)
     sure = surface_says >= options.gone_share
@@ -239,33 +243,88 @@ class _Paths:
 def _wall_shift(
     middle_mm: Points, evidence: Evidence, template: Template, options: SkippedOptions
 ) -> Points:
-    """How much farther in than planned the walls below and beside each look stand.
+    """How much farther in than planned the walls at each look stand.
 
     A part that has shrunk, or is laid a little aside, shows each wall farther in: its outermost
     lines are there, that much farther in too. The wall below tells; a line that is gone does not
-    move it.
+    move it. Where too little of a wall is below, in the first layers, all walls together do.
     """
-    s = evidence.surfels
     shift = np.zeros_like(middle_mm)
+    walls = _Walls.of(evidence, template, float(middle_mm[:, 2].max(initial=-np.inf)), options)
     low_mm = float(middle_mm[:, 2].max(initial=-np.inf)) - options.below_line_mm
-    which = np.flatnonzero(
-        (s.place_mm[:, 2] < low_mm)
-        & (s.place_mm[:, 2] > low_mm - options.wall_mm)
-        & (np.abs(s.deviation_mm) < options.most_shift_mm)
-    )
-    outward = unit_vectors(template.distance_and_gradient(s.place_mm[which])[1])
-    wall = np.abs(outward[:, 2]) < options.upright_wall
-    which, outward = which[wall], outward[wall, :2]
-    near = cKDTree(s.place_mm[which, :2]).query(
-        middle_mm[:, :2], k=options.wall_cells, distance_upper_bound=options.beside_wall_mm
-    )[1]
-    outward = np.vstack([outward, np.zeros(2)])[near]  # no neighbour is of no wall
-    same = np.einsum("akx,ax->ak", outward, outward[:, 0]) > options.same_wall
+    below = walls.some(walls.place_mm[:, 2] < low_mm)
+    same, near, outward = below.beside(middle_mm, options)
     ask = np.flatnonzero(same.sum(axis=1) >= options.least_wall_cells)
-    deviation_mm = np.append(s.deviation_mm[which], 0.0)[near[ask]]
+    deviation_mm = np.append(below.deviation_mm, 0.0)[near[ask]]
     farther_mm = np.nanmedian(np.where(same[ask], deviation_mm, np.nan), axis=1)
-    shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * outward[ask, 0]
+    shift[ask, :2] = np.minimum(farther_mm, 0.0)[:, None] * outward[ask]
+    rest = np.setdiff1d(np.arange(len(middle_mm)), ask)
+    beside = np.zeros(len(rest), bool)
+    for turn_rad in np.arange(0.0, 2.0 * np.pi, 0.25 * np.pi):
+        way_mm = options.beside_wall_mm * np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
+        beside |= template.distance(middle_mm[rest] + way_mm) > 0
+    rest = rest[beside]
+    if len(rest) and len(walls.place_mm):
+        shift[rest, :2] = walls.moved_by(middle_mm[rest, :2], options)
     return shift
+
+
+@dataclass(frozen=True, slots=True)
+class _Walls:
+    """Cells on upright walls, down to some depth below the lines: places, ways out, deviations."""
+
+    place_mm: Points
+    outward: Float[np.ndarray, "n 2"]
+    deviation_mm: Values
+
+    @classmethod
+    def of(
+        cls, evidence: Evidence, template: Template, high_mm: float, options: SkippedOptions
+    ) -> _Walls:
+        """Those that lie no farther off than a part shrinks."""
+        s = evidence.surfels
+        deep_mm = high_mm - options.below_line_mm - options.wall_mm
+        which = np.flatnonzero(
+            (s.place_mm[:, 2] > deep_mm) & (np.abs(s.deviation_mm) < options.most_shift_mm)
+        )
+        outward = unit_vectors(template.distance_and_gradient(s.place_mm[which])[1])
+        wall = np.abs(outward[:, 2]) < options.upright_wall
+        return cls(s.place_mm[which[wall]], outward[wall, :2], s.deviation_mm[which[wall]])
+
+    def some(self, pick: Mask) -> _Walls:
+        """Some of them."""
+        return _Walls(self.place_mm[pick], self.outward[pick], self.deviation_mm[pick])
+
+    def beside(
+        self, middle_mm: Float[np.ndarray, "m 3"], options: SkippedOptions
+    ) -> tuple[Bool[np.ndarray, "m k"], Int[np.ndarray, "m k"], Float[np.ndarray, "m 2"]]:
+        """(m, k) of the nearest cells those of the nearest one's wall; and (m, 2) its way out."""
+        near = cKDTree(self.place_mm[:, :2]).query(
+            middle_mm[:, :2], k=options.wall_cells, distance_upper_bound=options.beside_wall_mm
+        )[1]
+        outward = np.vstack([self.outward, np.zeros(2)])[near]  # no neighbour is of no wall
+        same = np.einsum("akx,ax->ak", outward, outward[:, 0]) > options.same_wall
+        return same, near, outward[:, 0]
+
+    def moved_by(
+        self, at_mm: Float[np.ndarray, "m 2"], options: SkippedOptions
+    ) -> Float[np.ndarray, "m 2"]:
+        """(m, 2) how places have moved by the shift, turn and shrinkage that walls agree on."""
+        low, high = box_of(self.place_mm)[:, :2]
+        reach_mm = max(0.5 * float((high - low).max()), LEVEL)
+        shrinks_mm = options.shrinks_ratio * reach_mm
+        prior_mm = np.array([*[options.most_shift_mm] * 3, shrinks_mm, shrinks_mm])
+
+        def ways(place_mm: Float[np.ndarray, "p d"]) -> Float[np.ndarray, "p 2 5"]:
+            x, y = (place_mm[:, :2] - 0.5 * (low + high)).T / reach_mm
+            none, one = np.zeros_like(x), np.ones_like(x)
+            rows = np.array([[one, none, -y, x, none], [none, one, x, none, y]])
+            return np.moveaxis(rows, 2, 0) * prior_mm
+
+        design = np.einsum("px,pxu->pu", self.outward, ways(self.place_mm))
+        share = np.full(len(design), options.wall_share)
+        found = solve(Problem(design, self.deviation_mm, share, options.wall_off_mm))
+        return np.asarray(ways(at_mm) @ found.unknown)
 
 
 def _sunk_mm(
@@ -299,6 +358,7 @@ def _shares(
     half_mm: Values,
     ask: Int[np.ndarray, " a"],
     rays_mm: Values,
+    sunk_mm: Values,
     paths: _Paths,
     scan: Scan,
     evidence: Evidence,
@@ -323,7 +383,7 @@ def _shares(
     topped = _topped(middle_mm[known], half, width_mm, evidence, options)
     below_mm = middle_mm[known] - 2.0 * half[:, None] * np.array([0.0, 0.0, 1.0])
     asked = np.flatnonzero(~topped & (surface < 0))
-    asked = asked[template.distance(below_mm[asked]) > 0]
+    asked = asked[(sunk_mm[known[asked]] == 0) & (template.distance(below_mm[asked]) > 0)]
     went = _went_through(known[asked], middle_mm, half_mm, paths, scan, options)
     told = np.flatnonzero(np.isfinite(went))
     surface[asked[told]] = rays[asked[told]] = went[told]
@@ -347,8 +407,6 @@ def _went_through(
     middle, however far aside the floor lies that it saw: between strands that hang apart slanting
     rays see all of what is under them.
     """
-    assert scan.sensors_mm is not None
-    assert scan.sensor_index is not None
     lines = paths.lines
     over_mm = (lines.end_mm - lines.start_mm)[paths.line[which], :2]
     along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
@@ -358,22 +416,20 @@ def _went_through(
     height_mm = np.round(middle_mm[which, 2], 6)
     for z_mm in np.unique(height_mm):
         mine = np.flatnonzero(height_mm == z_mm)
-        place_mm, high_mm = middle_mm[which[mine]], 2.0 * half_mm[which[mine]]
-        met = np.flatnonzero(scan.points_mm[:, 2] < z_mm + high_mm.max())
-        points_mm = scan.points_mm[met]
-        way = scan.sensors_mm[scan.sensor_index[met]] - points_mm
-        back = (z_mm - points_mm[:, 2]) / np.maximum(way[:, 2], LEVEL)
-        crossing_mm = points_mm[:, :2] + back[:, None] * way[:, :2]
+        place_mm, thick_mm = middle_mm[which[mine]], 2.0 * half_mm[which[mine]]
+        came, crossing_mm = rays_crossing(
+            scan, place_mm[:, :2], reach_mm, z_mm, z_mm + float(thick_mm.max())
+        )
         near = cKDTree(place_mm[:, :2]).query(crossing_mm, distance_upper_bound=reach_mm)[1]
-        came = np.flatnonzero((near < len(mine)) & (way[:, 2] > 0))
-        look = near[came]
-        off_mm = crossing_mm[came] - place_mm[look, :2]
-        x, y = along[mine[look]].T
-        in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[look]]
-        deep_mm = (z_mm - points_mm[came, 2]) / high_mm[look]
-        on += np.bincount(mine[look[in_core & (deep_mm > 1.0)]], minlength=len(which))
+        met = near < len(mine)
+        near, crossing_mm, points_mm = near[met], crossing_mm[met], scan.points_mm[came[met]]
+        off_mm = crossing_mm - place_mm[near, :2]
+        x, y = along[mine[near]].T
+        in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[near]]
+        deep_mm = (z_mm - points_mm[:, 2]) / thick_mm[near]
+        on += np.bincount(mine[near[in_core & (deep_mm > 1.0)]], minlength=len(which))
         there = in_core & (np.abs(deep_mm) <= 1.0)
-        ended += np.bincount(mine[look[there]], minlength=len(which))
+        ended += np.bincount(mine[near[there]], minlength=len(which))
     with np.errstate(invalid="ignore"):
         return np.asarray((on - ended) / (on + ended))
 
