@@ -81,7 +81,7 @@ class Observed:
     f_mm, keep
         (n,) deviation of each point, and whether it is one of the part.
     surfels, outward
-        The points of the part, condensed, and (n, 3) unit vectors away from the template there.
+        The points of the part, condensed, and (s, 3) unit vectors away from the template there.
     images
         What rays saw.
     surface_mm, normals
@@ -99,7 +99,7 @@ class Observed:
     f_mm: Values
     keep: Mask
     surfels: Surfels
-    outward: Points
+    outward: Float[np.ndarray, "s 3"]
     images: tuple[RangeImage, ...]
     surface_mm: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
