@@ -148,13 +148,8 @@ def observed(
     if surfels.spacing_mm > options.spacing_mm:
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
-    # A cell speaks of the place nearest to it. Of what is gone none does, not even where a wall
-    # broke down to just below it: the ray that should have ended there says so.
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
-    feet_mm = surfels.place_mm - surfels.deviation_mm[:, None] * outward
-    absent = np.flatnonzero(~has_near(surface_mm, feet_mm, surfels.cell_mm))
-    found = passed(seen, surface_mm[absent], normals[absent])
-    crossed = replace(found, which=absent[found.which])
+    crossed = _crossed(seen, surfels, outward, surface_mm, normals)
     shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
     return Observed(
         scan,
@@ -170,6 +165,24 @@ def observed(
         crossed,
         shares,
     )
+
+
+def _crossed(
+    images: tuple[RangeImage, ...],
+    surfels: Surfels,
+    outward: Float[np.ndarray, "s 3"],
+    surface_mm: Float[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "m 3"],
+) -> Passed:
+    """Places that no cell speaks of and that rays passed.
+
+    A cell speaks of the place nearest to it. Of what is gone none does, not even where a wall broke
+    down to just below it: the ray that should have ended there says so.
+    """
+    feet_mm = surfels.place_mm - surfels.deviation_mm[:, None] * outward
+    absent = np.flatnonzero(~has_near(surface_mm, feet_mm, surfels.cell_mm))
+    found = passed(images, surface_mm[absent], normals[absent])
+    return replace(found, which=absent[found.which])
 
 
 def sites_of(
