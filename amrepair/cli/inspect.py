@@ -334,7 +334,7 @@ def _keep(folder: RunFolder, cloud: Scan, anomaly: AnomalyMap) -> None:
 
     console.write_whole(
         folder.file("anomaly.npz"),
-        lambda path: np.savez_compressed(
+        lambda path: np.savez(  # deflate saves a tenth of the size, in half a second
             path,
             points_mm=cloud.points_mm,
             deviation_mm=anomaly.deviation_mm,
