@@ -304,7 +304,8 @@ def _freedom(
 
     A class too small to be told has those of the one whose value it took.
     """
-    patch_of = _patches(scale, options)
+    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
+    patch_of = cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
     freedom = np.empty(classes)
     last = 1.0
     for k in range(classes):
@@ -374,25 +375,21 @@ def _usual_share(scale: Scale, outliers: Mask) -> float:
     Errors are all over a scan, a defect is at one place: counted among them, its own cells would
     be told as errors.
     """
-    window, cell = scale.cells_of(outliers)
-    beside = outliers[cell]
-    group = connected(window[beside], cell[beside], len(outliers))
-    largest = int(np.bincount(group[outliers], minlength=1).max())
+    largest = int(np.bincount(_groups(scale, outliers)[outliers], minlength=1).max())
     return float((outliers.sum() - largest) / len(outliers))
 
 
-def _patches(scale: Scale, options: RegionOptions) -> Numbers:
-    """(s,) places farther apart than errors hang together, each facing one way."""
-    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
-    return cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
+def _groups(scale: Scale, chosen: Mask) -> Numbers:
+    """(s,) number of the connected group that each chosen window belongs to."""
+    window, cell = scale.cells_of(chosen)
+    beside = chosen[cell]
+    return connected(window[beside], cell[beside], len(chosen))
 
 
 def _peaks(scale: Scale, z: Values, start: float) -> Float[np.ndarray, " p"]:
     """(p,) the highest of each connected group of windows that exceed `start`, rising."""
     over = z > start
-    window, cell = scale.cells_of(over)
-    beside = over[cell]
-    group = connected(window[beside], cell[beside], len(z))
+    group = _groups(scale, over)
     peak = np.full(len(z), -np.inf)
     np.maximum.at(peak, group[over], z[over])
     return np.sort(peak[peak > start])

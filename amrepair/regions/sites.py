@@ -217,7 +217,7 @@ def sites_of(
     place_mm = np.concatenate([surfels.place_mm, crossed_mm])
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
-    unknown = _behind_what_stands(seen, outward, anywhere_mm, options)
+    unknown = _behind_what_stands(seen, anywhere_mm, options)
     tolerance_mm[:, : len(surfels)][:, unknown] += diagonal(template.bounds_mm)
     if rounded_up is not None:
         tolerance_mm[1] += rounded_up(place_mm, value_mm)
@@ -252,9 +252,7 @@ def _at_most_through(
     return np.minimum(depth_mm, 2.0 * least_mm)
 
 
-def _behind_what_stands(
-    seen: Observed, outward: Points, tolerance_mm: float, options: RegionOptions
-) -> Mask:
+def _behind_what_stands(seen: Observed, tolerance_mm: float, options: RegionOptions) -> Mask:
     """(n,) whether a cell lies behind surface that stands, where nobody knows how thick it is.
 
     A template of scans is closed by a guess where no scan looked, as over the floor of a cup. What
@@ -268,7 +266,7 @@ def _behind_what_stands(
         return found
     deep = np.flatnonzero(surfels.deviation_mm < -tolerance_mm)
     depth_mm = -surfels.deviation_mm[deep]
-    feet_mm = surfels.place_mm[deep] + depth_mm[:, None] * outward[deep]
+    feet_mm = surfels.place_mm[deep] + depth_mm[:, None] * seen.outward[deep]
     near = nearest_within(feet_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     stands = (near >= 0) & (np.abs(surfels.deviation_mm[near]) <= tolerance_mm)
     to_guess_mm = coverage.to_guess_mm(surfels.place_mm[deep])

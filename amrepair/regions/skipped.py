@@ -343,13 +343,13 @@ def _sunk_mm(
     width_mm, height_mm = lines.width_mm[line], 2.0 * half_mm
     lower_mm = 2.0 * np.sqrt(width_mm * height_mm / np.pi) - height_mm
     low_mm = float(template.bounds_mm[0, 2])  # below lies the bed, or what nobody knows
-    sunk, rests = np.zeros(len(line), dtype=bool), np.zeros(len(line), dtype=bool)
-    for k in range(1, options.sunk_layers + 2):
-        below_mm = middle_mm.copy()
-        below_mm[:, 2] -= k * height_mm
-        void = (below_mm[:, 2] > low_mm) & (template.distance(below_mm) > 0)
-        sunk |= rests & void
-        rests |= ~void & (k == 1)
+
+    def void(layers: int) -> Mask:
+        below_mm = middle_mm - layers * height_mm[:, None] * np.array([0.0, 0.0, 1.0])
+        return np.asarray((below_mm[:, 2] > low_mm) & (template.distance(below_mm) > 0))
+
+    hung = np.any([void(k) for k in range(2, options.sunk_layers + 2)], axis=0)
+    sunk = ~void(1) & hung
     return np.where(sunk, np.clip(lower_mm, 0.0, half_mm), 0.0)
 
 

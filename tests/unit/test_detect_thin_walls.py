@@ -13,13 +13,13 @@ from functools import cache
 import manifold3d as m3
 import numpy as np
 import pytest
-import trimesh
 
 from amrepair.deficit import compute_deficit
 from amrepair.frames import Transform
 from amrepair.regions import detect
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
+from tests.analytic import ray_scan
 from tests.unit.loop_bench import solid_mesh
 
 SIGMA_MM = 0.03
@@ -45,30 +45,10 @@ def pieces(wall_mm: float) -> dict[str, m3.Manifold]:
     }
 
 
-def seen(solid: m3.Manifold, step_mm: float) -> Scan:
-    """By five sensors, on a bed; a ray every `step_mm`."""
-    bed = trimesh.creation.box(
-        extents=(60, 60, 1), transform=trimesh.transformations.translation_matrix([10, 8, -0.5])
-    )
-    mesh = trimesh.util.concatenate([solid_mesh(solid), bed])
-    middle, rng = np.array([10.0, 8.0, 6.0]), np.random.default_rng(1)
-    across = np.arange(-17.0, 17.0, step_mm)
-    places, index = [], []
-    for k, sensor in enumerate(SENSORS_MM):
-        ahead = (middle - sensor) / np.linalg.norm(middle - sensor)
-        right = np.cross(ahead, [0.3, 0.1, 1.0])
-        right /= np.linalg.norm(right)
-        a, b = (v.ravel()[:, None] for v in np.meshgrid(across, across))
-        ways = middle + a * right + b * np.cross(ahead, right) - sensor
-        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        origins = np.broadcast_to(sensor, ways.shape)
-        hit, ray, _ = mesh.ray.intersects_location(origins, ways, multiple_hits=False)
-        places.append(hit + ways[ray] * rng.normal(0, SIGMA_MM, len(ray))[:, None])
-        index.append(np.full(len(ray), k))
-    points = np.concatenate(places)
-    return Scan(
-        points, SIGMA_MM, "template", sensors_mm=SENSORS_MM, sensor_index=np.concatenate(index)
-    )
+def seen(solid: m3.Manifold) -> Scan:
+    """By five sensors, on a bed; a ray every 0.3 mm."""
+    points, who = ray_scan(solid, SENSORS_MM, spacing_mm=0.3, sigma_mm=SIGMA_MM, seed=1)
+    return Scan(points, SIGMA_MM, "template", sensors_mm=SENSORS_MM, sensor_index=who)
 
 
 @cache
@@ -96,18 +76,18 @@ def found_ratio(scan: Scan, wall_mm: float, gone: m3.Manifold) -> float:
 )
 def test_what_a_thin_wall_lost_is_found_by_the_rays_that_passed(piece: str, wall_mm: float) -> None:
     gone = pieces(wall_mm)[piece] ^ tube(wall_mm)
-    ratio = found_ratio(seen(tube(wall_mm) - gone, 0.3), wall_mm, gone)
+    ratio = found_ratio(seen(tube(wall_mm) - gone), wall_mm, gone)
     assert ratio > 0.85
 
 
 @pytest.mark.parametrize("piece", ["notch", "deep"])
 def test_without_sensors_it_is_found_where_cells_are_finer_than_the_wall(piece: str) -> None:
     gone = pieces(1.6)[piece] ^ tube(1.6)
-    scan = seen(tube(1.6) - gone, 0.3)
+    scan = seen(tube(1.6) - gone)
     bare = Scan(scan.points_mm, scan.sigma_mm, "template")
     assert found_ratio(bare, 1.6, gone) > 0.85
 
 
 @pytest.mark.parametrize("wall_mm", [0.8, 1.6])
 def test_a_sound_tube_is_sound(wall_mm: float) -> None:
-    assert detect(seen(tube(wall_mm), 0.3), template_of(wall_mm)).regions == ()
+    assert detect(seen(tube(wall_mm)), template_of(wall_mm)).regions == ()
