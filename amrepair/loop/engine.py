@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
+import manifold3d
 import numpy as np
 
 from amrepair.errors import AlignmentError, LoopError, ScannerError
@@ -397,6 +398,7 @@ class Run:
                 stop.line,
                 self._scanner.build_from_scanner,
                 repaired=passes > 0,
+                mended=self._filled_before(stop),
                 options=self._options.kinds,
             )
             decision = decide_look(
@@ -411,6 +413,14 @@ class Run:
                 objects=self._objects,
             )
         return plan, decision
+
+    def _filled_before(self, stop: Stop) -> manifold3d.Manifold | None:
+        """What was missing where something was last filled, but for this stop; build frame."""
+        filled = [look for look in self._looks if look.printed and look.stop != stop]
+        if not filled:
+            return None
+        first = next(look for look in filled if look.stop == filled[-1].stop)
+        return first.plan.deficit.missing
 
     def _outcome(self, look: Look, taped: dict[str, object] | None) -> Look:
         """Ask whoever is to be asked; a taped look was answered then."""

@@ -25,6 +25,7 @@ from amrepair.loop.shapes import chain as chain_of
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import RepairPlan, Site
+from gcode.meshes import box_of_solid
 from gcode.reader import Job
 
 
@@ -68,6 +69,7 @@ def typed(
     build_from_scanner: Transform,
     *,
     repaired: bool = False,
+    mended: manifold3d.Manifold | None = None,
     options: KindOptions = USUAL_KINDS,
 ) -> RepairPlan:
     """The plan with every region typed.
@@ -81,6 +83,8 @@ def typed(
     repaired
         A patch lies on the layer by now: its beads no longer tell, in the order in which the job
         laid them, how much came out.
+    mended
+        What was missing at the stop before and was filled there, build frame.
     """
     layer_mm = plan.layer_height_mm
     seen = _surfaces(plan, site, options)
@@ -106,6 +110,7 @@ def typed(
             job,
             line,
             at_rim=rim,
+            mended=mended,
             layer_mm=layer_mm,
             options=options,
         )
@@ -329,6 +334,7 @@ def _of_region(
     line: int,
     *,
     at_rim: bool,
+    mended: manifold3d.Manifold | None,
     layer_mm: float,
     options: KindOptions,
 ) -> TypeGuess:
@@ -346,8 +352,12 @@ def _of_region(
     layers = 0.0 if piece is None else piece.volume() / layer_mm / float(piece.project().area())
     if flow is not None and (
         flow.type is DefectType.UNDER_EXTRUSION
-        # what is gone of the layers below has a place
-        or (flow.type is DefectType.CLOG and layers <= options.clog_layers)
+        # what is gone of the layers below, or was until it was filled there, has a place
+        or (
+            flow.type is DefectType.CLOG
+            and layers <= options.clog_layers
+            and (piece is None or not _is_over(piece, mended, layer_mm))
+        )
     ):
         return flow
     long_mm, wide_mm, along = spread([piece] if piece is not None else [])
@@ -360,6 +370,17 @@ def _of_region(
     if layers > options.whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
         return TypeGuess(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
     return TypeGuess(region.type, 0.95)
+
+
+def _is_over(
+    piece: manifold3d.Manifold, mended: manifold3d.Manifold | None, layer_mm: float
+) -> bool:
+    """Whether most of a piece lies over what was filled in the layer below it."""
+    if mended is None:
+        return False
+    over, low_mm = piece.project(), float(box_of_solid(piece)[0, 2])
+    below = over.extrude(1.5 * layer_mm).translate((0.0, 0.0, low_mm - layer_mm)) ^ mended
+    return float(below.project().area()) > 0.5 * float(over.area())
 
 
 def _at_rim(plan: RepairPlan, site: Site, box_mm: Box, options: KindOptions) -> bool:

@@ -196,8 +196,39 @@ def test_what_broke_off_where_the_last_beads_end_is_no_clog(
         depth_mm=0.2 * layers, box_mm=np.array([[0.0, 0.0, 0.0], [3.0, 5.0, 0.2 * layers]]),
     )  # fmt: skip
     found = kinds._of_region(
-        region, [piece], flow, job, stop.line, at_rim=True, layer_mm=0.2, options=USUAL_KINDS
+        region, [piece], flow, job, stop.line, at_rim=True, mended=None, layer_mm=0.2,
+        options=USUAL_KINDS,
+    )  # fmt: skip
+    assert found.type is kind
+
+
+@pytest.mark.parametrize(
+    ("down_mm", "aside_mm", "kind"),
+    [(0.2, 0.3, DefectType.VOID), (0.2, 4.0, DefectType.CLOG), (4.0, 0.3, DefectType.CLOG)],
+)
+def test_what_is_gone_where_the_layer_below_was_filled_is_no_clog(
+    scene,  # type: ignore[no-untyped-def]
+    down_mm: float,
+    aside_mm: float,
+    kind: DefectType,
+) -> None:
+    # regression: of a void where each layer's beads end two layers were filled and the third ended
+    # the run as a clog; but what filled them came out of that nozzle
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    flow = kinds._flow(
+        short_top(beads, np.arange(len(beads)) > 0.7 * len(beads)), job, stop.line, 0.2, USUAL_KINDS
     )
+    piece = Manifold.cube([3.0, 4.0, 0.2])
+    region = Region(
+        label=Label.MISSING, type=DefectType.VOID, volume_mm3=piece.volume(), area_mm2=12.0,
+        depth_mm=0.2, box_mm=np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.2]]),
+    )  # fmt: skip
+    mended = piece.translate((aside_mm, 0.0, -down_mm))
+    found = kinds._of_region(
+        region, [piece], flow, job, stop.line, at_rim=False, mended=mended, layer_mm=0.2,
+        options=USUAL_KINDS,
+    )  # fmt: skip
     assert found.type is kind
 
 
