@@ -47,8 +47,14 @@ class SkippedOptions:
         line.
     under_share
         Of a line's width: a ray that meets it so near to its middle ends there.
+    held_share
+        Of a line's width: with less over what lies below a line hangs; walls that lean are held
+        by a sixth.
     sunk_layers
         So many layers over strands that hang lie lower by what strands hang lower: a skin's three.
+    sunk_cells, least_sunk_cells, sunk_reach_mm, sunk_share
+        How much lower, so many of the nearest cells over strands tell, a few at least, no farther
+        off: of their depths this quantile, as of lines that are gone the floor lies deeper.
     """
 
     look_step_mm: float = 0.25
@@ -77,7 +83,12 @@ class SkippedOptions:
     about: int = 6
     top_share: float = 1.0
     under_share: float = 0.25
+    held_share: float = 0.15
     sunk_layers: int = 3
+    sunk_cells: int = 24
+    least_sunk_cells: int = 4
+    sunk_reach_mm: float = 2.0
+    sunk_share: float = 0.25
 
 
 USUAL_SKIPPED = SkippedOptions()

@@ -110,7 +110,11 @@ def skipped(
     ask = np.flatnonzero(rays_mm > 0)
     middle[ask] += _wall_shift(middle[ask], evidence, template, options)
     sunk_mm = np.zeros(len(line))
-    sunk_mm[ask] = _sunk_mm(middle[ask], half_mm[ask], line[ask], lines, template, options)
+    if len(ask):
+        top_mm = middle[ask] + half_mm[ask, None] * np.array([0.0, 0.0, 1.0])
+        width_mm, height_mm = lines.width_mm[line[ask]], lines.height_mm[line[ask]]
+        hanging = _Hanging.of(beads, template, options)
+        sunk_mm[ask] = _sunk_mm(top_mm, width_mm, height_mm, hanging, evidence, options)
     middle[:, 2] -= sunk_mm
     rays_mm[ask] = evidence.rays_say(middle[ask])
     ask = ask[rays_mm[ask] > 0]
@@ -327,30 +331,87 @@ class _Walls:
         return np.asarray(ways(at_mm) @ found.unknown)
 
 
+@dataclass(frozen=True, slots=True)
+class _Hanging:
+    """Nozzle positions at which beads hang, and their widths and heights."""
+
+    place_mm: Points
+    width_mm: Values
+    height_mm: Values
+
+    @classmethod
+    def of(cls, beads: PlannedBeads, template: Template, options: SkippedOptions) -> _Hanging:
+        """Where nothing but a sliver of a bead rests on the layer below.
+
+        A line that sticks out of the layer below rests on it by the rest of its width, however far
+        the one below that is from reaching there: walls that lean, and what closes over a hole.
+        """
+        place_mm, which = places_to_ends(beads.start_mm, beads.end_mm, options.look_step_mm)
+        over_mm = (beads.end_mm - beads.start_mm)[:, :2]
+        along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
+        rests_mm = (0.5 - options.held_share) * beads.width_mm[:, None]
+        aside_mm = (rests_mm * along[:, ::-1] * np.array([-1.0, 1.0]))[which]
+        width_mm, height_mm = beads.width_mm[which], beads.height_mm[which]
+        below_mm = place_mm - 1.5 * height_mm[:, None] * np.array([0.0, 0.0, 1.0])
+        # lower lies the bed, or what nobody knows
+        hangs = np.flatnonzero(below_mm[:, 2] > template.bounds_mm[0, 2])
+        for side in (0.0, -1.0, 1.0):
+            under_mm = below_mm[hangs]
+            under_mm[:, :2] += side * aside_mm[hangs]
+            hangs = hangs[template.distance(under_mm) > 0]
+        return cls(place_mm[hangs], width_mm[hangs], height_mm[hangs])
+
+    def under(self, top_mm: Points, options: SkippedOptions) -> Mask:
+        """Which tops of lines lie on layers that were laid on it, and hang not themselves."""
+        found = np.zeros(len(top_mm), dtype=bool)
+        tree = cKDTree(self.place_mm[:, :2])
+        reach_mm = float(self.width_mm.max(initial=0.0))
+        off_mm = tree.query(top_mm[:, :2], distance_upper_bound=reach_mm)[0]
+        beside = np.flatnonzero(np.isfinite(off_mm))
+        near = tree.query_ball_point(top_mm[beside, :2], reach_mm)
+        for k, others in zip(beside, near, strict=True):
+            layers = (top_mm[k, 2] - self.place_mm[others, 2]) / self.height_mm[others]
+            over = (layers > 0.5) & (layers < options.sunk_layers + 0.5)
+            found[k] = over.any() and not (np.abs(layers) <= 0.5).any()
+        return found
+
+
 def _sunk_mm(
-    middle_mm: Points,
-    half_mm: Values,
-    line: Numbers,
-    lines: PlannedBeads,
-    template: Template,
+    top_mm: Points,
+    width_mm: Values,
+    height_mm: Values,
+    hanging: _Hanging,
+    evidence: Evidence,
     options: SkippedOptions,
 ) -> Values:
     """How much lower than its layer each look's line lies because it was laid on strands.
 
     What hangs is round: of its plastic some lies below its layer, and what is laid on it fills
-    the grooves between strands first. So the layers over a bridge or over lettering are all lower.
+    the grooves between strands first. So the layers over a bridge or over lettering are all lower,
+    by no more than that; by how much tells what was seen around. What is gone lies lower still.
     """
-    width_mm, height_mm = lines.width_mm[line], 2.0 * half_mm
-    lower_mm = 2.0 * np.sqrt(width_mm * height_mm / np.pi) - height_mm
-    low_mm = float(template.bounds_mm[0, 2])  # below lies the bed, or what nobody knows
-
-    def void(layers: int) -> Mask:
-        below_mm = middle_mm - layers * height_mm[:, None] * np.array([0.0, 0.0, 1.0])
-        return np.asarray((below_mm[:, 2] > low_mm) & (template.distance(below_mm) > 0))
-
-    hung = np.any([void(k) for k in range(2, options.sunk_layers + 2)], axis=0)
-    sunk = ~void(1) & hung
-    return np.where(sunk, np.clip(lower_mm, 0.0, half_mm), 0.0)
+    found_mm = np.zeros(len(top_mm))
+    which = np.flatnonzero(hanging.under(top_mm, options))
+    if not len(which):
+        return found_mm
+    top_mm, height_mm = top_mm[which], height_mm[which]
+    most_mm = 2.0 * np.sqrt(width_mm[which] * height_mm / np.pi) - height_mm
+    most_mm = np.clip(most_mm, 0.0, 0.5 * height_mm)
+    place_mm, reach_mm = evidence.surfels.place_mm, options.sunk_reach_mm
+    off_mm = cKDTree(top_mm).query(place_mm, distance_upper_bound=reach_mm)[0]
+    place_mm = place_mm[np.isfinite(off_mm)]
+    place_mm = place_mm[hanging.under(place_mm, options)]
+    near = cKDTree(place_mm[:, :2]).query(
+        top_mm[:, :2], k=options.sunk_cells, distance_upper_bound=reach_mm
+    )[1]
+    lower_mm = top_mm[:, 2:] - np.append(place_mm[:, 2], np.nan)[near]
+    mine = np.abs(lower_mm - most_mm[:, None]) < height_mm[:, None]  # not of another layer
+    told = mine.sum(axis=1) >= options.least_sunk_cells
+    here_mm = 0.5 * most_mm
+    lower_mm = np.where(mine, lower_mm, np.nan)[told]
+    here_mm[told] = np.nanquantile(lower_mm, options.sunk_share, axis=1)
+    found_mm[which] = np.clip(here_mm, 0.0, most_mm)
+    return found_mm
 
 
 def _shares(

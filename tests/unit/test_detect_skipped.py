@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import manifold3d as m3
 import numpy as np
 import pytest
@@ -386,21 +384,72 @@ def test_strands_over_a_shallow_pocket_are_there_though_its_floor_is_seen_betwee
     assert told_mm[~right].sum() == 0.0
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_layer_over_strands_lies_lower_and_lacks_no_line(seed: int) -> None:
+@pytest.mark.parametrize("lower_mm", [0.0, 0.12])
+@pytest.mark.parametrize("gone", [range(0), range(4, 6)])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_layer_over_strands_lies_lower_and_lacks_what_is_gone_only(
+    lower_mm: float, gone: range, seed: int
+) -> None:
     # regression: the fourth layer over a Benchy's lettering, which fills the grooves between round
-    # strands first and lay 0.1 mm lower, had 1.2 mm³ of its lines told missing
-    lower_mm, top_mm = 0.12, HANGS_MM + HIGH_MM
+    # strands first and lay 0.1 mm lower, had 1.2 mm³ of its lines told missing; looked at as low as
+    # it may lie, a layer that lay no lower had no line told that was gone
+    top_mm = HANGS_MM + HIGH_MM
     solid, beads = strands(0.42, 0.3, range(0))
     box = m3.Manifold.cube((24.0, 18.0, HIGH_MM)).translate((0.0, 0.0, HANGS_MM))
     pocket = m3.Manifold.cube((24.0, 4.0, 2 * HIGH_MM)).translate((0.0, 7.0, HANGS_MM - HIGH_MM))
     planned = strands(0.42, 0.3, range(99))[0] + box + pocket
     template = MeshSdf.from_mesh(analytic.to_trimesh(planned))
     over = np.array([0.0, 0.0, HIGH_MM])
-    lines = replace(beads, start_mm=beads.start_mm + over, end_mm=beads.end_mm + over)
+    start_mm, end_mm = (np.concatenate([at, at + over]) for at in (beads.start_mm, beads.end_mm))
+    lines = PlannedBeads(start_mm, end_mm, *np.tile([beads.width_mm, beads.height_mm], 2))
     sunk = solid + box + pocket - pocket.translate((0.0, 0.0, 2 * HIGH_MM - lower_mm))
+    for row in gone:
+        bar = m3.Manifold.cube((24.0 - 2 * RIM_MM, WIDE_MM, 1.0))
+        low_mm = HANGS_MM - lower_mm
+        sunk -= bar.translate((RIM_MM, beads.start_mm[row, 1] - WIDE_MM / 2, low_mm))
     points, who = analytic.ray_scan(sunk, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
     scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
     anomaly = detect(scan, template, top_z_mm=top_mm)
     assert anomaly.evidence is not None
-    assert len(skipped(lines, scan, anomaly.evidence, template).width_mm) == 0
+    found = skipped(lines, scan, anomaly.evidence, template)
+    told_mm = np.linalg.norm(found.end_mm - found.start_mm, axis=1)
+    right = np.isin(found.start_mm[:, 1], beads.start_mm[list(gone), 1])
+    assert told_mm[right].sum() == pytest.approx(21.6 * len(gone), rel=0.2)
+    assert told_mm[~right].sum() == 0.0
+
+
+LEANS = 0.8  # mm outwards a mm of height: an overhang of 39°
+
+
+def leaning(gone_mm: tuple[float, float]) -> tuple[m3.Manifold, PlannedBeads]:
+    """A block whose front leans outwards, its wall's two lines in the last two layers."""
+    front = [(LEANS * TOP_MM, 0.0), (12.0, 0.0), (12.0, TOP_MM), (0.0, TOP_MM)]
+    body = m3.CrossSection([front]).extrude(24.0).rotate((90, 0, 90))
+    z = np.repeat([TOP_MM, TOP_MM - HIGH_MM], 2)
+    y = LEANS * (TOP_MM - z + HIGH_MM / 2) + WIDE_MM * np.array([0.5, 1.5, 0.5, 1.5])
+    start, end = (np.column_stack([np.full(4, x), y, z]) for x in (0.0, 24.0))
+    beads = PlannedBeads(start, end, np.full(4, WIDE_MM), np.full(4, HIGH_MM))
+    bar = m3.Manifold.cube((gone_mm[1] - gone_mm[0], 2.0 * WIDE_MM, 1.0))
+    return body - bar.translate((gone_mm[0], y[0] - 0.5 * WIDE_MM, TOP_MM - HIGH_MM)), beads
+
+
+@pytest.mark.parametrize("gone_mm", [(8.0, 8.0), (8.0, 13.0)])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_line_of_a_wall_that_leans_lies_no_lower_for_it(
+    gone_mm: tuple[float, float], seed: int
+) -> None:
+    # regression: where the second layer below ended farther in, as over every hole's crown, a line
+    # was taken to lie on strands that hang, 0.1 mm lower, where the floor of one that was gone lay:
+    # of four such lines two stayed open
+    solid, beads = leaning(gone_mm)
+    template = MeshSdf.from_mesh(analytic.to_trimesh(leaning((0.0, 0.0))[0]))
+    scan = scan_of(solid, seed)
+    evidence = detect(scan, template, top_z_mm=TOP_MM).evidence
+    assert evidence is not None
+    found = skipped(beads, scan, evidence, template)
+    told_mm = [
+        (found.end_mm - found.start_mm)[(found.start_mm[:, 1:] == start[1:]).all(axis=1), 0].sum()
+        for start in beads.start_mm
+    ]
+    long_mm = gone_mm[1] - gone_mm[0]
+    assert told_mm == pytest.approx([long_mm, long_mm, 0.0, 0.0], abs=0.75)
