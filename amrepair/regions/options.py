@@ -33,6 +33,9 @@ class SkippedOptions:
     gone_again, least_again_mm, same_layer_mm
         In a layer of which a stretch is gone others need less, and may be shorter; but rays alone
         do not do: between thin walls of infill they say "open" of many.
+    there_share
+        A stretch does not go on where the surface lies, on the whole, so much of half a line or
+        more above its middle: rays alone do not do.
     below_line_mm, wall_mm, most_shift_mm, upright_wall
         The walls that tell how far in a line stands: so far below the last lines' middles and so
         deep, as far off as a part shrinks and no farther, and upright (cosine).
@@ -69,6 +72,7 @@ class SkippedOptions:
     gone_again: float = 0.35
     least_again_mm: float = 1.0
     same_layer_mm: float = 0.05
+    there_share: float = 0.5
     below_line_mm: float = 0.1
     wall_mm: float = 2.0
     most_shift_mm: float = 0.35

@@ -137,7 +137,8 @@ def skipped(
     sure |= likely & (surface_says > 0)
     least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
     kept = paths.kept(gone | likely, sure, least_mm)
-    return paths.stretches(paths.grown(kept, by_both, options))
+    grows = np.minimum(by_both, by_surface + options.there_share)
+    return paths.stretches(paths.grown(kept, grows, options))
 
 
 @dataclass(frozen=True, slots=True)
