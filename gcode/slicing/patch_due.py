@@ -138,9 +138,10 @@ def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
     """
     options = model.options
     assert model.job is not None
-    own = model.wanted_below(at.z_mm) - model.wanted_below(at.z_mm - at.layer_mm)
+    below = model.wanted_below(at.z_mm)
+    own, deep = (below - model.wanted_below(at.z_mm - mm) for mm in (at.layer_mm, at.most_mm))
     goes_on = model.top_mm > at.z_mm + options.due.agree_mm
-    gone = np.where(goes_on, own > at.most_mm - at.layer_mm, own > 0)
+    gone = np.where(goes_on, deep > at.most_mm - at.layer_mm, own > 0)
     return beside(gone, model.job.near, options.lines.rim_mm, model.cell_mm)
 
 

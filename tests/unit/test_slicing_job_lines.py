@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import manifold3d as m3
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from jaxtyping import Float
 
 from gcode.moves import Extrude
-from gcode.profiles import load_setup
+from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job_lines import JobLines, JobPieces, gathered
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import USUAL_PATCH
@@ -26,15 +28,15 @@ X0, Y0, LONG_MM = 60.0, 60.0, 20.0
 TOP_MM = 2.0
 
 
-def hatch(z_mm: float, count: int = 40) -> JobLines:
+def hatch(z_mm: float, count: int = 40, high_mm: float = HIGH_MM) -> JobLines:
     """Lines along X, side by side in Y."""
     y = Y0 + (np.arange(count) + 0.5) * WIDE_MM
     start = np.column_stack([np.full(count, X0), y, np.full(count, z_mm)])
     return JobLines(
         start,
         start + np.array([LONG_MM, 0.0, 0.0]),
-        np.full(count, WIDE_MM * HIGH_MM),
-        np.full(count, HIGH_MM),
+        np.full(count, WIDE_MM * high_mm),
+        np.full(count, high_mm),
         np.zeros(count, dtype=bool),
     )
 
@@ -78,13 +80,15 @@ def test_columns_beside_lines_are_those_that_shapes_hold(seed: int) -> None:
     assert np.mean(found == truth) > 0.999  # but for what lies at the rim to rounding
 
 
-def patched(missing: m3.Manifold, field: HeightField, lines: JobLines) -> PatchPlan:
+def patched(
+    missing: m3.Manifold, field: HeightField, lines: JobLines, setup: PrintSetup = SETUP
+) -> PatchPlan:
     """The patch of it, in mid-job."""
     return slice_patch(
         missing,
-        SETUP,
+        setup,
         as_built=field,
-        grid=LayerGrid.from_setup(SETUP),
+        grid=LayerGrid.from_setup(setup),
         standalone=False,
         start_mm=PARK,
         lines=lines,
@@ -213,6 +217,32 @@ def test_over_open_cells_a_line_gets_what_the_job_laid_there(rounded_mm: float) 
     assert set(beads_of(plan)[:, 2].round(3)) == {TOP_MM}
     laid = 12.0 * WIDE_MM * HIGH_MM
     assert plan.beads_mm3 == pytest.approx(USUAL_PATCH.beads.bond_ratio * laid, rel=0.12)
+
+
+@pytest.mark.parametrize("high_mm", [0.1, 0.12, 0.15, 0.2])
+def test_what_is_gone_of_many_thin_layers_is_filled_from_the_floor_up(high_mm: float) -> None:
+    # regression: where the next layer's bead is as thick as two layers, each layer of a hole left
+    # its own to the next one; of a chip through 17 layers of 0.1 mm a lid alone was laid
+    process = SETUP.process.model_copy(
+        update={"layer_height_mm": high_mm, "first_layer_height_mm": high_mm}
+    )
+    layers = round(TOP_MM / high_mm)
+    top_mm = layers * high_mm
+    block = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, top_mm)).translate((X0, Y0, 0.0))
+    size = (12.0, 20 * WIDE_MM, 0.5 * top_mm)
+    missing = m3.Manifold.cube(size).translate((X0 + 4.0, Y0 + 10 * WIDE_MM, 0.5 * top_mm))
+    missing -= (
+        m3.Manifold.cube((40.0, 40.0, 5.0))
+        .rotate((0.0, 4.0, 0.0))
+        .translate((X0, Y0, -5.0 + 0.5 * top_mm + 1.0))
+    )
+    plan = patched(
+        missing,
+        HeightField.from_manifold(block - missing, 0.1, margin_mm=15.0),
+        stacked(*(hatch((k + 1) * high_mm, high_mm=high_mm) for k in range(layers))),
+        replace(SETUP, process=process),
+    )
+    assert plan.beads_mm3 > 0.85 * missing.volume()
 
 
 def test_without_lines_there_it_draws_its_own():
