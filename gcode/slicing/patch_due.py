@@ -133,15 +133,16 @@ def due_of_job(
 def _gone_at(model: PatchModel, at: Height) -> Bool[np.ndarray, "ny nx"]:
     """Columns where something of the layer that ends at a height is missing, and beside them.
 
-    A deficit that goes on above, and begins no deeper below than a bead of the next layer gets, is
-    that layer's: a scanner's spot rounds off ridges one line wide, and their flanks lie lower.
+    A deficit that goes on above, takes less than this layer, and begins no deeper than a bead of
+    the next one gets, is that one's: a scanner's spot rounds off ridges one line wide, and their
+    flanks lie lower.
     """
     options = model.options
     assert model.job is not None
-    below = model.wanted_below(at.z_mm)
-    own, deep = (below - model.wanted_below(at.z_mm - mm) for mm in (at.layer_mm, at.most_mm))
+    own = model.wanted_below(at.z_mm) - model.wanted_below(at.z_mm - at.layer_mm)
     goes_on = model.top_mm > at.z_mm + options.due.agree_mm
-    gone = np.where(goes_on, deep > at.most_mm - at.layer_mm, own > 0)
+    least_mm = min(at.most_mm - at.layer_mm, at.layer_mm) - ROUNDING_MM
+    gone = np.where(goes_on, own > least_mm, own > 0)
     return beside(gone, model.job.near, options.lines.rim_mm, model.cell_mm)
 
 
