@@ -11,6 +11,10 @@ A kernel that may add up in any order (`fastmath`) and is called by another is i
 process that loads the caller from disk the caller's copy, which adds up in another order: the same
 scan, judged twice, differed in its fourteenth digit.
 
+How a kernel adds up and divides is its own affair. Where it does not say so, numba compiles it as
+the kernel that asked for it first: one that a fast kernel calls added up in any order on one
+machine, and in its own on another.
+
 A kernel is compiled for types of arguments, not for values: numba compiles a kernel that another
 calls with `True` or `1` in its text once more for that very value, and no kernel asks for it.
 
@@ -46,6 +50,8 @@ __all__ = ["get_num_threads", "njit", "prange", "read_only", "set_num_threads"]
 
 _KERNEL_PACKAGES = ("gcode", "amrepair")
 _PROCESS_TOKEN = secrets.token_hex(4)
+# What numba leaves to the kernel that calls, where a kernel does not say it itself.
+OWN_OPTIONS: dict[str, Any] = {"fastmath": False, "error_model": "python"}
 # The slowest kernel takes six seconds alone, with all that it calls eleven.
 LONGEST_COMPILE_S = 60.0
 COMPILE_POLL_S = 0.02
@@ -120,6 +126,7 @@ shapes_unsaid()
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit`, once for each type of arguments, and kept safely where it is kept."""
+    options = OWN_OPTIONS | options
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
@@ -241,19 +248,19 @@ class _Turn:
 
 
 def kernels_stamp() -> tuple[tuple[str, int, int], ...]:
-    """Name, time of change and size of every file with kernels."""
-    return sources_stamp("_kernels.py")
+    """Name, time of change and size of every file with kernels, and of how they are compiled."""
+    return sources_stamp(("_kernels.py", Path(__file__).name))
 
 
 @functools.cache
-def sources_stamp(ending: str) -> tuple[tuple[str, int, int], ...]:
+def sources_stamp(endings: tuple[str, ...]) -> tuple[tuple[str, int, int], ...]:
     """Name, time of change and size of every file of both packages that ends so."""
     root = Path(__file__).parents[1]
     found = []
     for package in _KERNEL_PACKAGES:
         for folder, _, names in os.walk(root / package):
             for name in names:
-                if name.endswith(ending):
+                if name.endswith(endings):
                     stat = Path(folder, name).stat()
                     found.append((name, stat.st_mtime_ns, stat.st_size))
     return tuple(sorted(found))

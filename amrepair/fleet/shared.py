@@ -35,7 +35,7 @@ _PIPE_BYTES = 1 << 20
 def mark() -> bytes:
     """What two processes must have in common to come to the same bits: program and threads."""
     threads = get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS")
-    return hashlib.sha256(f"{__version__} {sources_stamp('.py')} {threads}".encode()).digest()
+    return hashlib.sha256(f"{__version__} {sources_stamp(('.py',))} {threads}".encode()).digest()
 
 
 @dataclass(frozen=True, slots=True)

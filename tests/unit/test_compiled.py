@@ -114,6 +114,26 @@ def test_a_value_in_a_kernels_text_is_no_type_of_its_own() -> None:
 
 
 @compiled.njit()
+def ratio(value: float, by: float) -> float:
+    return value / by + value
+
+
+@compiled.njit(fastmath=True, error_model="numpy")
+def hasty(value: float, by: float) -> float:
+    return ratio(value, by) + value
+
+
+def test_a_kernel_is_the_same_whichever_other_one_asked_for_it_first() -> None:
+    # regression: compiled for a fast kernel, a plain one that it calls was fast, too, and kept so:
+    # two copies of one source laid a patch in different places
+    hasty(1.0, 2.0)
+    (code,) = ratio.inspect_llvm().values()
+    assert " fast " not in code
+    with pytest.raises(ZeroDivisionError):
+        ratio(1.0, 0.0)
+
+
+@compiled.njit()
 def put(target: np.ndarray, given: np.ndarray) -> None:
     target[1:] = given
 
