@@ -20,6 +20,7 @@ from amrepair.loop.shapes import last_beads
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import plan_repair
+from gcode.meshes import box_of_solid
 from gcode.profiles import load_setup
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_kinds.py"
@@ -173,6 +174,28 @@ def test_a_curl_is_one() -> None:
     assert found.type is DefectType.WARP
 
 
+def told_of(  # type: ignore[no-untyped-def]
+    scene, piece: Manifold, shape: DefectType, *, low_mm: float, at_rim: bool,
+    mended: Manifold | None = None,
+) -> DefectType:  # fmt: skip
+    """What a piece is told to be, which has a shape's type, where the last beads lie too low."""
+    job, stop, _, _ = scene
+    beads = last_beads(job, stop.line)
+    gone = np.arange(len(beads)) > 0.7 * len(beads)
+    top = top_of(np.where(gone, -low_mm, 0.0), beads[:, :2], 0.03)
+    flow = kinds._flow(top, job, stop.line, 0.2, USUAL_KINDS)
+    box_mm = box_of_solid(piece)
+    region = Region(
+        label=Label.MISSING, type=shape, volume_mm3=piece.volume(),
+        area_mm2=float(piece.project().area()), depth_mm=float(np.ptp(box_mm[:, 2])),
+        box_mm=box_mm,
+    )  # fmt: skip
+    return kinds._of_region(
+        region, [piece], flow, job, stop.line, at_rim=at_rim, mended=mended, layer_mm=0.2,
+        options=USUAL_KINDS,
+    ).type  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("layers", "kind"), [(0.8, DefectType.CLOG), (2.5, DefectType.CHIP), (6.0, DefectType.CHIP)]
 )
@@ -185,21 +208,9 @@ def test_what_broke_off_where_the_last_beads_end_is_no_clog(
 ) -> None:
     # regression: a chip six layers deep, where the last beads of a part lie, ended the run; and so
     # did one of which the top's points, near its rim, showed less than the solid that is missing
-    job, stop, _, _ = scene
-    beads = last_beads(job, stop.line)
-    gone = np.arange(len(beads)) > 0.7 * len(beads)
-    top = top_of(np.where(gone, -0.2 * seen_layers, 0.0), beads[:, :2], 0.03)
-    flow = kinds._flow(top, job, stop.line, 0.2, USUAL_KINDS)
     piece = Manifold.cube([3.0, 5.0, 0.2 * layers])
-    region = Region(
-        label=Label.MISSING, type=DefectType.CHIP, volume_mm3=piece.volume(), area_mm2=15.0,
-        depth_mm=0.2 * layers, box_mm=np.array([[0.0, 0.0, 0.0], [3.0, 5.0, 0.2 * layers]]),
-    )  # fmt: skip
-    found = kinds._of_region(
-        region, [piece], flow, job, stop.line, at_rim=True, mended=None, layer_mm=0.2,
-        options=USUAL_KINDS,
-    )  # fmt: skip
-    assert found.type is kind
+    found = told_of(scene, piece, DefectType.CHIP, low_mm=0.2 * seen_layers, at_rim=True)
+    assert found is kind
 
 
 @pytest.mark.parametrize(
@@ -214,22 +225,10 @@ def test_what_is_gone_where_the_layer_below_was_filled_is_no_clog(
 ) -> None:
     # regression: of a void where each layer's beads end two layers were filled and the third ended
     # the run as a clog; but what filled them came out of that nozzle
-    job, stop, _, _ = scene
-    beads = last_beads(job, stop.line)
-    flow = kinds._flow(
-        short_top(beads, np.arange(len(beads)) > 0.7 * len(beads)), job, stop.line, 0.2, USUAL_KINDS
-    )
     piece = Manifold.cube([3.0, 4.0, 0.2])
-    region = Region(
-        label=Label.MISSING, type=DefectType.VOID, volume_mm3=piece.volume(), area_mm2=12.0,
-        depth_mm=0.2, box_mm=np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.2]]),
-    )  # fmt: skip
     mended = piece.translate((aside_mm, 0.0, -down_mm))
-    found = kinds._of_region(
-        region, [piece], flow, job, stop.line, at_rim=False, mended=mended, layer_mm=0.2,
-        options=USUAL_KINDS,
-    )  # fmt: skip
-    assert found.type is kind
+    found = told_of(scene, piece, DefectType.VOID, low_mm=0.2, at_rim=False, mended=mended)
+    assert found is kind
 
 
 def short_top(beads: np.ndarray, gone: np.ndarray) -> kinds._Surface:

@@ -47,9 +47,9 @@ def stacked(*layers: JobLines) -> JobLines:
     return JobLines(*(np.concatenate([getattr(one, name) for one in layers]) for name in names))
 
 
-def field_of(missing: m3.Manifold) -> HeightField:
+def field_of(missing: m3.Manifold, top_mm: float = TOP_MM) -> HeightField:
     """What is left of a block without it."""
-    block = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, TOP_MM)).translate((X0, Y0, 0.0))
+    block = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, top_mm)).translate((X0, Y0, 0.0))
     return HeightField.from_manifold(block - missing, 0.1, margin_mm=15.0)
 
 
@@ -228,7 +228,6 @@ def test_what_is_gone_of_many_thin_layers_is_filled_from_the_floor_up(high_mm: f
     )
     layers = round(TOP_MM / high_mm)
     top_mm = layers * high_mm
-    block = m3.Manifold.cube((LONG_MM, 40 * WIDE_MM, top_mm)).translate((X0, Y0, 0.0))
     size = (12.0, 20 * WIDE_MM, 0.5 * top_mm)
     missing = m3.Manifold.cube(size).translate((X0 + 4.0, Y0 + 10 * WIDE_MM, 0.5 * top_mm))
     missing -= (
@@ -238,7 +237,7 @@ def test_what_is_gone_of_many_thin_layers_is_filled_from_the_floor_up(high_mm: f
     )
     plan = patched(
         missing,
-        HeightField.from_manifold(block - missing, 0.1, margin_mm=15.0),
+        field_of(missing, top_mm),
         stacked(*(hatch((k + 1) * high_mm, high_mm=high_mm) for k in range(layers))),
         replace(SETUP, process=process),
     )
