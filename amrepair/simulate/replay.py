@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.arrays import Numbers, PlanePoints, Points, Values, Vector
+from amrepair.frames import unit_vectors
 from amrepair.simulate.options import USUAL_REPLAY
 from amrepair.simulate.recording import Recording, edge_distance_mm
 
@@ -102,8 +103,7 @@ class Replay:
         aside /= np.linalg.norm(aside)
         frame = np.stack([aside, np.cross(aside, inward), -inward])  # the view's own axes
         seen = (points_mm - sensor_mm) @ frame.T
-        rays = points_mm - sensor_mm
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = unit_vectors(points_mm - sensor_mm)
         cosine = np.clip(-np.einsum("ij,ij->i", rays, normals), 0.0, 1.0)
         cell_mm = 2.0 * max(self._pitch_mm, spacing_mm)
         edge_mm = edge_distance_mm(seen[:, :2], seen[:, 2], cell_mm)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Box, HeightMap, Mask, Numbers, Points, Values, Vector
 from amrepair.errors import ScannerError
-from amrepair.frames import Transform, rotation_from_vector
+from amrepair.frames import Transform, in_box, rotation_from_vector, unit_vectors
 from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.columns import IntervalMap
@@ -166,11 +166,12 @@ class SimulatedScanner:
                 sensor,
                 targets,
             )
-            seen = self._measured(points, normals, kinds, sensor, bounds)
+            rays = unit_vectors(points - sensor)
+            cosine = -np.einsum("ij,ij->i", rays, normals)
+            seen = self._measured(points, cosine, kinds, bounds)
             seen &= self._unhidden(solid, top_mm, sensor, points)
-            at_rest = np.where((kinds == BED)[:, None], points, self.world.as_cooled(points))
             if self._replay is None:
-                noise = self._noise(points, normals, sensor)[seen]
+                noise = self._noise(rays, cosine)[seen]
             else:
                 noise = self._replay.errors_mm(
                     points[seen],
@@ -179,7 +180,9 @@ class SimulatedScanner:
                     spacing_mm=self.model.line_step_mm or self.model.spacing_mm,
                     rng=self._rng,
                 )
-            clouds.append(at_rest[seen] + noise)
+            part = seen & (kinds != BED)
+            points[part] = self.world.as_cooled(points[part])
+            clouds.append(points[seen] + noise)
             indices.append(np.full(len(noise), index, dtype=np.int64))
         scanner_from_build = self._pose.build_from_scanner_true.inverse()
         return Scan(
@@ -207,14 +210,11 @@ class SimulatedScanner:
         grid = grid + self._rng.uniform(0.0, 1.0, grid.shape) * [spacing_mm, step_mm]
         return np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
 
-    def _measured(
-        self, points: Points, normals: Points, kinds: Numbers, sensor: Vector, bounds: Box
-    ) -> Mask:
+    def _measured(self, points: Points, cosine: Values, kinds: Numbers, bounds: Box) -> Mask:
         """(n,) which points send enough light back, and are asked for."""
-        cosine = _cosine(points, normals, sensor)
         margin_mm = self.model.bed_margin_mm
         low, high = bounds[0, :2] - margin_mm, bounds[1, :2] + margin_mm
-        near = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+        near = in_box(points[:, :2], low, high)
         keep = (cosine > np.cos(self.model.max_incidence_rad)) & ((kinds != BED) | near)
         if self.model.dropout_ratio > 0:
             lost = self.model.dropout_ratio / np.maximum(cosine, 0.1)
@@ -246,21 +246,11 @@ class SimulatedScanner:
             )
         )
 
-    def _noise(self, points: Points, normals: Points, sensor: Vector) -> Points:
+    def _noise(self, rays: Points, cosine: Values) -> Points:
         """(n, 3) errors, all along the rays."""
-        rays = points - sensor
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        cosine = np.maximum(_cosine(points, normals, sensor), 0.1)
-        noise_mm = self._rng.normal(size=len(points)) * self.model.sigma_mm
-        spread = noise_mm / cosine**self.model.slope_power
+        noise_mm = self._rng.normal(size=len(rays)) * self.model.sigma_mm
+        spread = noise_mm / np.maximum(cosine, 0.1) ** self.model.slope_power
         if self.model.outlier_ratio > 0:
-            shiny = self._rng.random(len(points)) < self.model.outlier_ratio
-            spread = spread + shiny * self._rng.laplace(0.0, self.model.outlier_mm, len(points))
+            shiny = self._rng.random(len(rays)) < self.model.outlier_ratio
+            spread = spread + shiny * self._rng.laplace(0.0, self.model.outlier_mm, len(rays))
         return np.asarray(rays * spread[:, None])
-
-
-def _cosine(points: Points, normals: Points, sensor: Vector) -> Values:
-    """(n,) cosine of the angle of incidence."""
-    rays = points - sensor
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return np.asarray(-np.einsum("ij,ij->i", rays, normals))

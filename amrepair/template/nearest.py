@@ -97,12 +97,12 @@ class TriangleTree:
         if len(points) < SORTED:
             size, which, place, side = kernels.nearest(points, self.sure, *self._numbers)
             return Nearest(size, side, self.face[which], place)
-        low = points.min(axis=0)
-        cell = (points.max(axis=0) - low) / SORT_CELLS + 1e-12
-        index = np.minimum((points - low) / cell, SORT_CELLS - 1).astype(np.int64)
-        order = np.argsort(
-            (index[:, 0] * SORT_CELLS + index[:, 1]) * SORT_CELLS + index[:, 2], kind="stable"
-        )
+        key = np.zeros(len(points), np.int64)
+        for along in points.T:
+            low = along.min()
+            cell = (along.max() - low) / SORT_CELLS + 1e-12
+            key = key * SORT_CELLS + np.minimum((along - low) / cell, SORT_CELLS - 1).astype(int)
+        order = np.argsort(key, kind="stable")
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         size, which, place, side = kernels.nearest(
