@@ -17,7 +17,7 @@ from amrepair.template.port import Template
 def level_on_bed(
     points_mm: Points, template: Template, matrix: Matrix, options: BedOptions = USUAL_ALIGN.bed
 ) -> tuple[Matrix, bool]:
-    """Correct a guess so that the bed that the scan shows lies at the template's lowest height.
+    """Correct a guess so that the bed that the scan shows lies where the template's foot stands.
 
     Parameters
     ----------
@@ -30,9 +30,9 @@ def level_on_bed(
     -------
     The corrected guess, and whether enough bed was seen to correct it.
     """
-    low = template.bounds_mm[0]
+    bed_z_mm = float(template.bounds_mm[0, 2]) - options.under_foot_mm
     placed = moved(points_mm[:: max(1, len(points_mm) // options.most_points)], matrix)
-    near = np.flatnonzero(np.abs(placed[:, 2] - low[2]) < options.band_mm)
+    near = np.flatnonzero(np.abs(placed[:, 2] - bed_z_mm) < options.band_mm)
     if len(near) < options.least_points:
         return matrix, False
     near = near[:: -(-len(near) // options.most_fitted)]
@@ -46,7 +46,7 @@ def level_on_bed(
     if spread_mm2[0] < options.least_spread_mm**2:  # a strip of bed does not tell its tilt
         return matrix, False
     design = np.column_stack([local[:, :2], np.ones(len(local))])
-    target = bed[:, 2] - low[2]
+    target = bed[:, 2] - bed_z_mm
     fit, scale = np.zeros(3), options.band_mm
     for _ in range(options.rounds):
         residual = target - design @ fit
@@ -59,7 +59,7 @@ def level_on_bed(
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     turn = rotation_from_vector(axis * (np.arcsin(min(1.0, float(np.linalg.norm(axis))))
                                         / max(float(np.linalg.norm(axis)), 1e-12)))  # fmt: skip
-    pivot = np.array([*centre[:2], low[2] + fit[2]])
+    pivot = np.array([*centre[:2], bed_z_mm + fit[2]])
     level = rigid(turn, pivot - turn @ pivot - np.array([0.0, 0.0, fit[2]]))
     return level @ matrix, True
 

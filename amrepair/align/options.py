@@ -376,10 +376,12 @@ class BedOptions:
     ----------
     most_points, most_fitted
         Of the scan, and of the bed: it is a plane.
+    under_foot_mm
+        How far under the part's foot the bed lies: the height of the raft that it stands on.
     band_mm
         How far off the guess may have the bed.
     skirt_mm
-        Bed points this near to the part may be its skirt or its foot.
+        Bed points this near to the part may be its skirt, its foot or its raft.
     least_points
         Of the bed.
     least_spread_mm
@@ -392,6 +394,7 @@ class BedOptions:
 
     most_points: int = 80_000
     most_fitted: int = 10_000
+    under_foot_mm: float = 0.0
     band_mm: float = 1.0
     skirt_mm: float = 2.0
     least_points: int = 300

@@ -44,7 +44,7 @@ BESIDE_THE_PART = frozenset(
     }
 )  # fmt: skip
 THING_STEP_MM, THING_CELL_MM = 0.8, 0.2
-RAFT_LAYERS = 1.5  # a raft has two layers at least, and walls tell the height to about one
+OFF_LAYERS = 1.5  # walls tell the height to about a layer; a raft has two and more
 UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
 
@@ -153,8 +153,10 @@ def locate_parts(
                 "prints copies of one part"
             ) from error
     progress("locate", float(count), float(count))
+    begins_mm = foot_mm(job)
     return tuple(
-        _on_bed(_untilted(placed, template), template, layer_height_mm) for placed in found
+        _on_foot(_untilted(placed, template), template, begins_mm, layer_height_mm)
+        for placed in found
     )
 
 
@@ -261,16 +263,34 @@ def _untilted(placed: Transform, template: Template) -> Transform:
     )
 
 
-def _on_bed(placed: Transform, template: Template, layer_height_mm: float) -> Transform:
-    """The pose with the part's lowest point on the bed: walls tell height the least."""
+def first_layer(job: Job) -> int:
+    """The first layer that has beads of a part in it; those before are a raft, seldom any."""
+    ours = job.beads.layer[~of_roles(job.beads, BESIDE_THE_PART)]
+    return int(ours[ours >= 0].min()) if (ours >= 0).any() else 0
+
+
+def foot_mm(job: Job) -> float:
+    """Where a part's lowest beads begin: on the bed, or on the raft that the job lays before."""
+    beads, first = job.beads, first_layer(job)
+    if first == 0:
+        return 0.0
+    lowest = (beads.layer == first) & ~of_roles(beads, BESIDE_THE_PART)
+    return float(np.median(beads.start_mm[lowest, 2] - beads.height_mm[lowest]))
+
+
+def _on_foot(
+    placed: Transform, template: Template, begins_mm: float, layer_height_mm: float
+) -> Transform:
+    """The pose with the part's lowest point where its beads begin: walls tell height the least."""
     surface, _ = template.surface_points(1.0)
     low_mm = float(placed.apply(surface)[:, 2].min())
-    limit_mm = RAFT_LAYERS * layer_height_mm
-    if abs(low_mm) > limit_mm:
+    limit_mm = OFF_LAYERS * layer_height_mm
+    if abs(low_mm - begins_mm) > limit_mm:
         raise AlignmentError(
-            f"the part found in the job stands {low_mm:.2f} mm off the bed, the limit is "
-            f"{limit_mm:g} mm; jobs with a raft cannot be repaired yet"
+            f"the part found in the job stands {low_mm:.2f} mm above the bed, its lowest beads "
+            f"begin at {begins_mm:.2f} mm, and they may be {limit_mm:g} mm apart; is it this part, "
+            "and does the job say what is raft and what is part?"
         )
     matrix = placed.matrix.copy()
-    matrix[2, 3] -= low_mm
+    matrix[2, 3] -= low_mm - begins_mm
     return Transform(placed.target, placed.source, matrix)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amrepair.errors import InputError
+from amrepair.loop.locate import first_layer
 from amrepair.policy import Decision
 from amrepair.policy.passes import may_be_left
 from amrepair.policy.worth import volume_mm3
@@ -153,12 +154,14 @@ def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
 def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[Stop, ...]:
     """Stops after the given layers, rising, and one for the finished part.
 
+    Where only the raft is laid there is nothing to look at, and no stop.
+
     Raises
     ------
     InputError
         If the job has no such layer.
     """
-    stops = []
+    stops, first = [], first_layer(job)
     for index in sorted(set(layers)):
         if not 0 <= index < len(job.layers):
             raise InputError(
@@ -166,7 +169,7 @@ def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[
                 f"{len(job.layers) - 1}"
             )
         layer = job.layers[index]
-        if index < len(job.layers) - 1 or not final:
+        if first <= index and (index < len(job.layers) - 1 or not final):
             stops.append(Stop(index, layer.end_line, layer.z_mm))
     if final:
         stops.append(Stop(None, job.footer_start_line, job.layers[-1].z_mm))

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from amrepair.errors import InputError, LoopError
+from amrepair.loop.locate import first_layer
 from amrepair.loop.looks import Look, Stop, plan_stops
 from amrepair.policy.table import Action
 from gcode.reader import Job
@@ -63,7 +64,8 @@ class Stops:
     def __init__(self, job: Job, fixed: Sequence[Stop], pace: Pace | None) -> None:
         self._job, self._fixed, self._pace = job, list(fixed), pace
         self._gap = pace.every if pace is not None else 0
-        self._due = self._gap - 1  # layers count from 0: the third is number 2
+        # layers count from 0: the third is number 2
+        self._due = max(self._gap - 1, first_layer(job))
 
     def next(self) -> Stop | None:
         """The next stop; None where there is none left."""

@@ -9,13 +9,14 @@ import numpy as np
 
 from amrepair.arrays import Mask
 from amrepair.frames import Transform
-from amrepair.loop.locate import BESIDE_THE_PART, of_roles
+from amrepair.loop.locate import BESIDE_THE_PART, first_layer, foot_mm, of_roles
 from amrepair.loop.looks import Stop
 from amrepair.regions import detect
 from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
+from amrepair.repair.site import Raft
 from amrepair.template import KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import JobBridges
@@ -74,6 +75,7 @@ def sites(
     )
     template_from_build = build_from_template.inverse()
     kept = KeptFills()
+    first, raft = first_layer(job), _raft(job, template, template_from_build)
 
     def at(stop: Stop) -> Site:
         if stop.layer_index is None:
@@ -86,15 +88,17 @@ def sites(
                 calibration=NORMAL_NOISE,
                 lines=lines_of_job(job, every, setup),
                 beside=_beside(job, every),
+                raft=raft,
                 laid=_laid(job, every, kept),
             )
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
         done = (beads.line < stop.line) & (beads.layer >= 0)
+        over_raft = done & (beads.layer >= first)
         start, end = (
-            template_from_build.apply(place[done]) for place in (beads.start_mm, beads.end_mm)
+            template_from_build.apply(place[over_raft]) for place in (beads.start_mm, beads.end_mm)
         )
-        section, height = beads.section_mm2[done], beads.height_mm[done]
+        section, height = beads.section_mm2[over_raft], beads.height_mm[over_raft]
         planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
         recent = PlannedBeads.recent(start, end, section, height)
         below = template.below_z(z_mm)
@@ -109,7 +113,8 @@ def sites(
             beads=recent,
             lines=lines_of_job(job, done, setup),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
-            beside=None if by_beads else _beside(job, done),
+            beside=_beside(job, done & ~over_raft if by_beads else done),
+            raft=raft,
             laid=_laid(job, done, kept),
         )
 
@@ -130,6 +135,17 @@ def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:
         beads.layer[pick],
         kept=kept,
     )
+
+
+def _raft(job: Job, template: Template, template_from_build: Transform) -> Raft | None:
+    """What the job lays before its first layer of the part; None where that is on the bed."""
+    beads = job.beads
+    under = (beads.layer >= 0) & (beads.layer < first_layer(job))
+    if not under.any():
+        return None
+    ends = np.concatenate([beads.start_mm[under], beads.end_mm[under]])
+    far_mm = template.distance(template_from_build.apply(ends)).max()
+    return Raft(foot_mm(job), float(far_mm + beads.width_mm[under].max()))
 
 
 def _beside(job: Job, which: Mask) -> HeightField | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from amrepair.loop.locate import OUTER_WALLS, of_roles
+from amrepair.loop.locate import OUTER_WALLS, first_layer, of_roles
 from gcode.errors import ReadError
 from gcode.reader import Job
 
@@ -56,6 +56,7 @@ class Places:
         self._first = np.searchsorted(beads.layer, np.arange(len(job.layers)), side="left")
         self._stop = np.searchsorted(beads.layer, np.arange(len(job.layers)), side="right")
         self._outer = of_roles(beads, OUTER_WALLS)
+        self._first_layer = first_layer(job)
         self.width_mm = float(np.median(beads.width_mm))
 
     def is_spiral(self, layer: int) -> bool:
@@ -69,7 +70,7 @@ class Places:
         """The best place after a layer; None where there is none: a spiral, another object next."""
         layers = self._job.layers
         last = int(self._job.beads.line[self._stop[layer] - 1])
-        if self.is_spiral(layer):
+        if layer < self._first_layer or self.is_spiral(layer):
             return None
         if layer + 1 == len(layers):
             return self._best(layer, last + 1, self._end_of_footer(last), (layer,))

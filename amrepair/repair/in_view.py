@@ -92,9 +92,13 @@ def aligning(site: Site) -> AlignOptions:
     """How a scan is aligned: of a low print, points from half its height on are the part's.
 
     After the first layer of 0.2 mm nothing of it is higher over the bed than a finished part's
-    points have to be.
+    points have to be. Where the part stands on a raft, the bed lies deeper, and farther out.
     """
     top_mm, options = top_of_layer(site), site.options.align
+    if site.raft is not None:
+        bed, raft = options.bed, site.raft
+        bed = replace(bed, under_foot_mm=raft.height_mm, skirt_mm=max(bed.skirt_mm, raft.reach_mm))
+        options = replace(options, bed=bed)
     if top_mm is None:
         return options
     half_mm = 0.5 * (top_mm - float(site.template.bounds_mm[0, 2]))

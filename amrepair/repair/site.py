@@ -29,6 +29,22 @@ Detector = Callable[..., AnomalyMap]
 
 
 @dataclass(frozen=True, slots=True)
+class Raft:
+    """What a job lays under a part, so that its foot is not on the bed.
+
+    Attributes
+    ----------
+    height_mm
+        How high over the bed the part's foot is.
+    reach_mm
+        How far out of the part the raft goes.
+    """
+
+    height_mm: float
+    reach_mm: float
+
+
+@dataclass(frozen=True, slots=True)
 class Site:
     """What is expected where: all that a scan is held against.
 
@@ -69,6 +85,8 @@ class Site:
     beside
         How high skirt, brim and supports stand beside the part, build frame, where the template
         does not have them; −inf where nothing does. They are none of the part, nor too much.
+    raft
+        What a job lays under the part; None where it stands on the bed.
     laid
         The job's beads so far, build frame: what its own path puts beyond what is expected
         (heights that are rounded up, plastic that has no room) is not too much.
@@ -102,6 +120,7 @@ class Site:
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
+    raft: Raft | None = None
     laid: LaidBeads | None = None
     detector: Detector = detect
     options: RepairOptions = USUAL_REPAIR
