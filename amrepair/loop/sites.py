@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from amrepair.arrays import Mask
 from amrepair.frames import Transform
@@ -29,6 +32,9 @@ from gcode.surfaces.lines import columns_around, heights_by_lines
 
 # Around what the job lays beside the part: strands spread, and stringy ones stray.
 STRINGS_MM, BESIDE_CELL_MM = 0.4, 0.25
+LEFT_OPEN_LAYERS = (
+    2.0  # lower than the drawing by more, a place is open: slopes and rounding make one
+)
 RIMS = ("perimeter", "wall")  # what slicers call it
 
 
@@ -42,6 +48,7 @@ class Expected:
     by_beads: bool
     detector: Detector
     _at: Callable[[Stop], Site]
+    _ends_open: Callable[[], bool]
 
     def __call__(self, stop: Stop) -> Site:
         """At one stop."""
@@ -49,9 +56,9 @@ class Expected:
 
     def of(self, job: Job) -> Expected:
         """The same of another job: what is left of it, say."""
-        return sites(
-            job, self.template, self.build_from_template, self.setup, by_beads=self.by_beads,
-            detector=self.detector,
+        return _expected(
+            job, self.template, self.build_from_template, self.setup, self.by_beads, self.detector,
+            self._ends_open,
         )  # fmt: skip
 
 
@@ -68,8 +75,26 @@ def sites(
 
     A finished part is judged by its template. A layer is, too, where `by_beads` is false (all of
     it is planned to be solid); else by the beads that the job planned, so that open infill is
-    none of the defects.
+    none of the defects; so is a finished part that the job leaves open at its top, as a vase.
     """
+
+    @functools.cache
+    def ends_open() -> bool:
+        return by_beads and _left_open(job, template, build_from_template)
+
+    return _expected(job, template, build_from_template, setup, by_beads, detector, ends_open)
+
+
+def _expected(
+    job: Job,
+    template: Template,
+    build_from_template: Transform,
+    setup: PrintSetup,
+    by_beads: bool,
+    detector: Detector,
+    ends_open: Callable[[], bool],
+) -> Expected:
+    """As `sites`; what the whole job ends with is asked once, whatever is left of it later."""
     grid = LayerGrid.from_tops(
         [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
     )
@@ -78,7 +103,7 @@ def sites(
     first, raft = first_layer(job), _raft(job, template, template_from_build)
 
     def at(stop: Stop) -> Site:
-        if stop.layer_index is None:
+        if stop.layer_index is None and not ends_open():
             every = job.beads.layer >= 0
             return Site(
                 template,
@@ -118,7 +143,7 @@ def sites(
             laid=_laid(job, done, kept),
         )
 
-    return Expected(template, build_from_template, setup, by_beads, detector, at)
+    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_open)
 
 
 def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:
@@ -135,6 +160,26 @@ def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:
         beads.layer[pick],
         kept=kept,
     )
+
+
+def _left_open(job: Job, template: Template, build_from_template: Transform) -> bool:
+    """Whether a job leaves holes of two beads' width in the part, open to above: no top, a vase."""
+    beads = job.beads
+    solid: Any = template.solid()
+    part = HeightField.from_manifold(
+        solid.transform(build_from_template.matrix[:3]), BESIDE_CELL_MM, margin_mm=STRINGS_MM
+    )
+    pick = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
+    start, end = beads.start_mm[pick], beads.end_mm[pick]
+    half_mm = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6)
+    laid_mm = heights_by_lines(
+        start, end, half_mm, np.maximum(start[:, 2], end[:, 2]),
+        low_mm=part.origin_mm, cell_mm=BESIDE_CELL_MM, shape=part.z_mm.shape,
+    )  # fmt: skip
+    least_mm = LEFT_OPEN_LAYERS * np.median(beads.height_mm[pick])
+    lower = (part.z_mm > 0.0) & (part.z_mm - laid_mm > least_mm)
+    room_mm = (ndimage.distance_transform_edt(lower) - 0.5) * BESIDE_CELL_MM
+    return bool(room_mm.max() > 2.0 * np.median(half_mm))
 
 
 def _raft(job: Job, template: Template, template_from_build: Transform) -> Raft | None:

@@ -1,0 +1,63 @@
+"""What is expected of a finished part that its job leaves open."""
+
+from __future__ import annotations
+
+import manifold3d as m3
+import numpy as np
+from loop_bench import solid_mesh
+
+from amrepair.frames import Transform
+from amrepair.loop.looks import plan_stops
+from amrepair.loop.sites import sites
+from amrepair.repair import RepairPlan, plan_repair
+from amrepair.scans import Scan
+from amrepair.template import MeshSdf
+from gcode.profiles import load_setup
+from gcode.reader import Job, job_for
+from gcode.slicing.job import plan_part
+from gcode.writer import write
+from tests import analytic
+
+SETUP = load_setup(process="repair_0.20")
+FLOOR_MM, WALL_MM = 0.6, 2.0
+BLOCK = m3.Manifold.cube((20.0, 14.0, 5.0)).translate((90.0, 90.0, 0.0))
+HOLLOW = m3.Manifold.cube((20.0 - 2 * WALL_MM, 14.0 - 2 * WALL_MM, 9.0)).translate(
+    (90.0 + WALL_MM, 90.0 + WALL_MM, FLOOR_MM)
+)
+
+
+def job_of(part: m3.Manifold) -> Job:
+    return job_for(write(plan_part(part, SETUP).toolpath, SETUP, title="job").text, SETUP.printer)
+
+
+def looked_at(job: Job, stands: m3.Manifold) -> RepairPlan:
+    """What the final look at a part plans."""
+    template = MeshSdf.from_mesh(solid_mesh(BLOCK))
+    here = Transform.identity("build", "template")
+    site = sites(job, template, here, SETUP)(plan_stops(job, [])[-1])
+    sensors = np.array([[0.0, 0.0, 300.0], [200.0, 200.0, 300.0], [100.0, 97.0, 300.0]])
+    bed = m3.Manifold.cube((60.0, 60.0, 1.0)).translate((70.0, 70.0, -1.0))
+    points, who = analytic.ray_scan(stands + bed, sensors, spacing_mm=0.25, sigma_mm=0.03, seed=1)
+    scan = Scan(points, 0.03, "build", None, sensors, who)
+    guess = Transform.identity("template", "build")
+    return plan_repair(scan, site, title="x", guess=guess, strict=False)
+
+
+def test_what_a_job_leaves_open_at_its_top_is_not_missing() -> None:
+    """Jobs of PrusaSlicer without top layers were filled up at their end: 110 mm³; vases whole."""
+    cup = BLOCK - HOLLOW  # as slicers leave a block without top layers
+    job = job_of(cup)
+    assert not looked_at(job, cup).deficit.regions
+    bite = m3.Manifold.cube((5.0, 4.0, 1.2), True).translate((100.0, 90.0, 5.0))
+    found = looked_at(job, cup - bite).deficit
+    lost_mm3 = (cup ^ bite).volume()
+    assert abs(found.missing_mm3 - lost_mm3) < 0.15 * lost_mm3
+    assert (found.missing ^ bite).volume() > 0.85 * lost_mm3
+
+
+def test_a_part_that_is_closed_is_held_against_its_template() -> None:
+    job = job_of(BLOCK)
+    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
+    stop = plan_stops(job, [])[-1]
+    assert sites(job, template, here, SETUP)(stop).planned is None
+    assert sites(job_of(BLOCK - HOLLOW), template, here, SETUP)(stop).planned is not None
