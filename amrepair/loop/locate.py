@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy import ndimage
 
 from amrepair.align import align
 from amrepair.arrays import Box, Mask, Numbers, PlanePoints, Points, Values
-from amrepair.errors import AlignmentError
+from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, box_of, rotation_from_vector
 from amrepair.loop.outlines import outermost
 from amrepair.scans import Scan
@@ -117,7 +118,10 @@ def locate_parts(
     AlignmentError
         If walls do not fit the template to half a layer: another part, another scale, or one that
         stands beside ours.
+    InputError
+        If the job prints its objects one after the other.
     """
+    _refuse_one_after_another(job)
     beads = job.beads
     ours = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
     outer = ours & of_roles(beads, OUTER_WALLS)
@@ -263,19 +267,44 @@ def _untilted(placed: Transform, template: Template) -> Transform:
     )
 
 
+def _refuse_one_after_another(job: Job) -> None:
+    for before, after in pairwise(job.layers):
+        if after.z_mm < before.z_mm - max(before.height_mm, after.height_mm):
+            raise InputError(
+                f"the job prints its objects one after the other: layer {after.index} is laid at "
+                f"{after.z_mm:g} mm after one at {before.z_mm:g} mm; between them the head has no "
+                "way round what stands already, so slice them layer by layer (without 'complete "
+                "individual objects', 'one at a time')"
+            )
+
+
 def first_layer(job: Job) -> int:
     """The first layer that has beads of a part in it; those before are a raft, seldom any."""
     ours = job.beads.layer[~of_roles(job.beads, BESIDE_THE_PART)]
     return int(ours[ours >= 0].min()) if (ours >= 0).any() else 0
 
 
+def tops_of(job: Job) -> list[float]:
+    """How high each layer ends: one that is laid no lower than the next is pressed down by it.
+
+    Cura lays the first layer over a raft's gap so.
+    """
+    tops_mm = [layer.z_mm for layer in job.layers]
+    for k in range(len(tops_mm) - 2, -1, -1):
+        if tops_mm[k] >= tops_mm[k + 1]:
+            tops_mm[k] = tops_mm[k + 1] - job.layers[k + 1].height_mm
+    return tops_mm
+
+
 def foot_mm(job: Job) -> float:
-    """Where a part's lowest beads begin: on the bed, or on the raft that the job lays before."""
+    """Where a part's lowest layer begins: on the bed, or on the raft that the job lays before."""
     beads, first = job.beads, first_layer(job)
     if first == 0:
         return 0.0
     lowest = (beads.layer == first) & ~of_roles(beads, BESIDE_THE_PART)
-    return float(np.median(beads.start_mm[lowest, 2] - beads.height_mm[lowest]))
+    over = [layer.height_mm for layer in job.layers[first + 1 :]]  # the first one's may have a gap
+    height_mm = min(np.median(beads.height_mm[lowest]), np.median(over or [np.inf]))
+    return float(tops_of(job)[first] - height_mm)
 
 
 def _on_foot(

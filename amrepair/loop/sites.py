@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from amrepair.arrays import Mask
 from amrepair.frames import Transform
-from amrepair.loop.locate import BESIDE_THE_PART, first_layer, foot_mm, of_roles
+from amrepair.loop.locate import BESIDE_THE_PART, first_layer, foot_mm, of_roles, tops_of
 from amrepair.loop.looks import Stop
 from amrepair.regions import detect
 from amrepair.regions.calibration import NORMAL_NOISE
@@ -95,9 +95,7 @@ def _expected(
     ends_open: Callable[[], bool],
 ) -> Expected:
     """As `sites`; what the whole job ends with is asked once, whatever is left of it later."""
-    grid = LayerGrid.from_tops(
-        [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
-    )
+    grid = LayerGrid.from_tops(tops_of(job), layer_height_mm=setup.process.layer_height_mm)
     template_from_build = build_from_template.inverse()
     kept = KeptFills()
     first, raft = first_layer(job), _raft(job, template, template_from_build)

@@ -7,6 +7,7 @@ import re
 from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
+from statistics import median
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -255,19 +256,26 @@ def layers_of(
 
 
 def _with_heights(layers: list[JobLayer], comments: list[tuple[int, str]]) -> tuple[JobLayer, ...]:
-    """Heights as the slicer states them, where it does."""
+    """Heights as the slicer states them; of a layer no higher than the one before, as others are.
+
+    The next of objects that are printed one after the other begins as the first one did.
+    """
     stated = [
         (line, float(match.group(1)))
         for line, text in comments
         if (match := _HEIGHT.search(text)) is not None
     ]
     at = [line for line, _ in stated]
+    told = [layer.height_mm for layer in layers if layer.height_mm > _LEAST_LAYER_MM]
+    usual_mm = median(told) if told else 0.0
     out = []
     for layer in layers:
         k = bisect_right(at, layer.first_line)
         height_mm = layer.height_mm
         if k < len(stated) and stated[k][0] < layer.end_line and height_mm <= _LEAST_LAYER_MM:
             height_mm = stated[k][1]
+        elif height_mm <= _LEAST_LAYER_MM and layer.index:
+            height_mm = layers[0].height_mm if layer.z_mm <= layers[0].z_mm else usual_mm
         out.append(JobLayer(layer.index, layer.z_mm, height_mm, layer.first_line, layer.end_line))
     return tuple(out)
 

@@ -13,9 +13,17 @@ from jaxtyping import Float
 from loop_bench import solid_mesh
 
 from amrepair.deficit import compute_deficit
-from amrepair.errors import AlignmentError
+from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform, rotation_from_vector
-from amrepair.loop.locate import is_upright, locate_part, locate_parts, stood
+from amrepair.loop.locate import (
+    first_layer,
+    foot_mm,
+    is_upright,
+    locate_part,
+    locate_parts,
+    stood,
+    tops_of,
+)
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.sites import sites
 from amrepair.regions import Label, Region, detect
@@ -295,3 +303,28 @@ def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much() -> None:
         assert much.label is Label.EXCESS
         # half a cell's width of the ridges around it, 0.18 mm high, hangs together with it
         assert much.volume_mm3 == pytest.approx(16.0 * (5.6 - 5.12), rel=0.12)
+
+
+def test_a_job_that_prints_one_object_after_the_other_is_refused_in_a_sentence() -> None:
+    """It was "The tops of layers must ascend from above 0 mm.", after the part had been found."""
+    job = job_of(wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0)))
+    again = [replace(layer, index=len(job.layers) + layer.index) for layer in job.layers]
+    template = MeshSdf.from_mesh(solid_mesh(wedge()))
+    with pytest.raises(InputError, match=r"layer 30 is laid at 0.2 mm after one at 6 mm"):
+        locate_parts(replace(job, layers=(*job.layers, *again)), template, layer_height_mm=LAYER_MM)
+
+
+def test_a_first_layer_over_a_gap_is_pressed_down_by_the_next() -> None:
+    """Cura lays it 0.22 mm too high over its raft: its next one was of no height at all."""
+    heights = [0.3, 0.45, 0.65, 1.15, 1.13, *np.arange(1.33, 3.0, 0.2)]
+    lines = ["M83", "G92 E0"]
+    for k, z_mm in enumerate(heights):
+        lines += [f";LAYER:{k - 3}", f";TYPE:{'SUPPORT' if k < 3 else 'WALL-OUTER'}"]
+        lines += [f"G0 X20 Y20 Z{z_mm:.2f} F6000", "G1 X60 E2 F1200", "G1 Y60 E2"]
+    job = job_for("G28\nG90\n" + "\n".join(lines) + "\n", SETUP.printer)
+    assert first_layer(job) == 3
+    assert [layer.height_mm for layer in job.layers[4:6]] == pytest.approx([0.2, 0.2])
+    tops_mm = tops_of(job)
+    assert tops_mm[3] == pytest.approx(0.93)
+    assert (np.diff(tops_mm) > 0.0).all()
+    assert foot_mm(job) == pytest.approx(0.73)
