@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,12 @@ from gcode.cli import console
 from gcode.errors import GcodeError, LinkError
 from gcode.hosts.moonraker_job import KlipperJob
 from gcode.hosts.octoprint_job import OctoPrintJob
-from gcode.hosts.port import TellsTouches
+from gcode.hosts.port import PullsAtRest, TellsTouches
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.served_job import ServedJob, UnderWay
 from gcode.hosts.web import Address
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
+from gcode.resumption.head import state_at_rest
 from gcode.solids import SOLID_SUFFIXES
 from gcode.whole import write_bytes
 
@@ -264,7 +265,10 @@ class _Service:
             self._held = self._machine.rests_at()
             if self._held is None:
                 return
-            state = begun.job.state_after(self._held)
+            state = state_at_rest(begun.job, self._held)
+            if isinstance(self._machine, PullsAtRest):
+                pulled_mm = state.pulled_mm + self._machine.pulled_at_rest_mm()
+                state = replace(state, pulled_mm=pulled_mm)
             _, parked = park(begun.setup, state)
             self._machine.leave(way_back(begun.setup, state, parked))
         except LinkError:

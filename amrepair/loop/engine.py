@@ -39,7 +39,7 @@ from gcode.hosts.port import GoesOnAnew, LeavesOut, Printer, PrintReport
 from gcode.moves import ModalState
 from gcode.progress import Progress
 from gcode.reader import Job
-from gcode.resumption.head import pulled_back_mm
+from gcode.resumption.head import state_at_rest
 from gcode.resumption.rest import rest_without
 from gcode.resumption.standing import with_solid
 
@@ -148,7 +148,8 @@ class Run:
         now = self._course.stop(stop)
         if now is None:
             return True  # nothing is printed there any more
-        state, began = self._job.state_after(now.line), self._checked
+        state, began = state_at_rest(self._job, now.line), self._checked
+        state = replace(state, pulled_mm=state.pulled_mm + self._wire.pulled_at_rest_mm())
         site = self._expected(stop, now)
         with self._watch("print"):
             program, parked = travel.park(site.setup, state)
@@ -219,7 +220,7 @@ class Run:
         coming = [s.line for s in map(self._course.stop, self._stops) if s is not None]
         rest = rest_without(
             self._job, names, site.setup, first=now.line, parked=parked,
-            pulled_mm=pulled_back_mm(self._job, now.line) + machine.retraction_mm,
+            pulled_mm=parked.pulled_mm,
             standing=with_solid(
                 self._job.beads, now.line, machine, look.plan.deficit.excess
             ),
@@ -243,7 +244,7 @@ class Run:
         if self._tape.live:
             raise TapeEndsError("the record ends here")
         site = self._site_at(stop)
-        _, parked = travel.park(site.setup, self._job.state_after(stop.line))
+        _, parked = travel.park(site.setup, state_at_rest(self._job, stop.line))
         while self._tape.next_stop() == stop.label:
             self._try_to_look(stop, site, parked)
         return True

@@ -23,6 +23,7 @@ from gcode.hosts.port import PrintReport
 TAPE = "run.jsonl"
 LOOK_EVENTS = ("look", "no_look")
 TOUCH = "touch"
+REST = "rest"
 """Kind of what is sent to feel; the tape has where each touch met something."""
 FELT = "felt"
 """A scanner that has the printer move has done so: its scan follows from what is on the tape."""

@@ -16,17 +16,22 @@ from gcode.profiles import PrintSetup
 from gcode.writer import write
 
 PARK_LIFT_MM = 10.0
+NO_PULL_MM = 1e-4  # programs are written to less
 
 
 def park(setup: PrintSetup, state: ModalState) -> tuple[CheckedProgram, ModalState]:
-    """Retract, lift, go aside, rest; the program, and the machine's state after it."""
+    """Retract, lift, go aside, rest; the program, and the machine's state after it.
+
+    There the filament is pulled back by the printer's own retraction, however far the job had
+    pulled it: programs of ours begin and end so.
+    """
     machine = setup.printer
     x, y, z = (float(v) for v in state.position_mm)
     park_z = min(max(machine.park_mm[2], z + PARK_LIFT_MM), machine.max_z_mm)
     place = (machine.park_mm[0], machine.park_mm[1], park_z)
     moves: list[Move] = []
-    if machine.retraction_mm > 0:
-        moves.append(Retract(machine.retraction_mm, machine.retraction_speed_mm_s))
+    if (pull_mm := _still_to_pull_mm(setup, state)) != 0.0:
+        moves.append(Retract(pull_mm, machine.retraction_speed_mm_s))
     moves += [
         Travel(np.array([[x, y, park_z]]), machine.z_speed_mm_s),
         Travel(np.array([place]), machine.travel_speed_mm_s),
@@ -35,7 +40,7 @@ def park(setup: PrintSetup, state: ModalState) -> tuple[CheckedProgram, ModalSta
     program = _program(setup, moves, state, "park for a scan", restore=False)
     after = replace(
         state, position_mm=place, e_mm=0.0, absolute_xyz=True, absolute_e=False, units_mm=True,
-        pulled_mm=state.pulled_mm + machine.retraction_mm,
+        pulled_mm=machine.retraction_mm,
     )  # fmt: skip
     return program, after
 
@@ -51,13 +56,19 @@ def way_back(
         Travel(np.array([[x, y, park_z]]), machine.travel_speed_mm_s),
         Travel(np.array([[x, y, z]]), machine.z_speed_mm_s),
     ]
-    if machine.retraction_mm > 0:
-        moves.append(Retract(-machine.retraction_mm, machine.retraction_speed_mm_s))
+    if (pull_mm := _still_to_pull_mm(setup, state)) != 0.0:
+        moves.append(Retract(-pull_mm, machine.retraction_speed_mm_s))
     # the way back starts from the park; the modes are put back once the nozzle has arrived
     back = _program(setup, moves, parked, "back to the job", restore=False)
     arrived = replace(parked, position_mm=state.position_mm, pulled_mm=state.pulled_mm)
     modes = _program(setup, [], state, "go on with the job", restore=True, initial=arrived)
     return back, modes
+
+
+def _still_to_pull_mm(setup: PrintSetup, state: ModalState) -> float:
+    """From what the job has pulled to the printer's own retraction; negative: to push."""
+    pull_mm = setup.printer.retraction_mm - state.pulled_mm
+    return pull_mm if abs(pull_mm) > NO_PULL_MM else 0.0
 
 
 def _program(

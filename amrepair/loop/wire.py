@@ -11,9 +11,9 @@ from dataclasses import asdict, replace
 from typing import Any, Protocol, runtime_checkable
 
 from amrepair.errors import InputError, LoopError
-from amrepair.loop.tape import TOUCH, Sent, Tape, report_from_json
+from amrepair.loop.tape import REST, TOUCH, Sent, Tape, report_from_json
 from gcode.check import CheckedProgram
-from gcode.hosts.port import Printer, PrintReport, TellsTouches
+from gcode.hosts.port import Printer, PrintReport, PullsAtRest, TellsTouches
 from gcode.hosts.touching import felt
 from gcode.progress import Progress, silent
 
@@ -103,6 +103,20 @@ class Wire:
             return {key: taped[key] for key in said}
         self._tape.write(event, **said)
         return said
+
+    def pulled_at_rest_mm(self) -> float:
+        """Filament that the printer's own pause has pulled back; 0 where it has none of its own."""
+        if not isinstance(self._printer, PullsAtRest):
+            return 0.0
+        taped = self._tape.next_if(REST)
+        if taped is not None:
+            return float(taped["pulled_mm"])
+        if not self._tape.live:
+            return 0.0  # a record of before it was told
+        self.go_live()
+        pulled_mm = self._printer.pulled_at_rest_mm()
+        self._tape.write(REST, pulled_mm=pulled_mm)
+        return pulled_mm
 
     def go_live(self) -> PrintReport | None:
         """Before the first thing that the tape lacks: where is the printer?"""

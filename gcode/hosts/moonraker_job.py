@@ -204,6 +204,12 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
         return {name: int(told.get(name) or 0) for name in ("program", "begun", "done", "hotend",
                                                             "bed")}  # fmt: skip
 
+    def pulled_at_rest_mm(self) -> float:
+        """Filament that the user's `PAUSE` has pulled back, as our macros measured it."""
+        key = f"gcode_macro {STEP_MACRO}"
+        told = self._session.query({key: ["pulled"]}).get(key, {})
+        return max(0.0, float(told.get("pulled") or 0.0))
+
     def require_partner(self) -> None:
         """Refuse a printer without our macros."""
         self._steps()

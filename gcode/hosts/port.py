@@ -96,6 +96,15 @@ class PrintReport:
 
 
 @runtime_checkable
+class PullsAtRest(Protocol):
+    """A printer whose job pauses by a macro of its user's, which may pull filament back."""
+
+    def pulled_at_rest_mm(self) -> float:
+        """Filament that the pause has pulled back, beyond what the job had."""
+        ...
+
+
+@runtime_checkable
 class LeavesOut(Protocol):
     """A printer whose server prints the job, and can leave an object of it out by itself."""
 

@@ -6,6 +6,8 @@ straight down, and says again what the job had set.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -69,6 +71,11 @@ def filament_back_mm(job: Job) -> Float[np.ndarray, " m"]:
 def pulled_back_mm(job: Job, line: int) -> float:
     """Filament that the job has pulled back and not yet pushed out again."""
     return float(filament_back_mm(job)[line])
+
+
+def state_at_rest(job: Job, line: int) -> ModalState:
+    """The machine's state after lines [0, line) of a job, with what filament is pulled back."""
+    return replace(job.state_after(line), pulled_mm=pulled_back_mm(job, line))
 
 
 class Head:

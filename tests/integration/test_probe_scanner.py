@@ -22,6 +22,7 @@ from amrepair.simulate.run import PreparedRun
 from gcode.errors import PrinterError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.serial import SerialPrinter
+from gcode.resumption.head import state_at_rest
 
 LAYER = 9
 
@@ -104,7 +105,7 @@ def test_a_probe_that_does_not_trigger_ends_the_run_in_one_sentence(
     path = tmp_path / "standing.npz"
     standing(run, stop, rough_mm=0.0, seed=0).write(path)
     printer = run.setup.printer
-    program, rest = park(run.setup, run.job.state_after(stop.line))
+    program, rest = park(run.setup, state_at_rest(run.job, stop.line))
     with (
         EmulatedPrinterProcess(printer=printer, standing=path, dead_probe=True) as emulator,
         SerialPrinter(emulator.port) as host,
@@ -128,7 +129,7 @@ def test_touches_are_cold_true_and_told(run: PreparedRun, tmp_path: Path) -> Non
     path, record = tmp_path / "standing.npz", tmp_path / "record.txt"
     field = standing(run, stop, (0.0, 0.0, 30.0, 0.3), rough_mm=0.0, seed=0)
     field.write(path)
-    program, rest = park(run.setup, run.job.state_after(stop.line))
+    program, rest = park(run.setup, state_at_rest(run.job, stop.line))
     told: list[tuple[str, float, float]] = []
     with (
         EmulatedPrinterProcess(printer=run.setup.printer, standing=path, record=record) as emulator,

@@ -23,7 +23,7 @@ from amrepair.loop.travel import park, way_back
 from gcode.moves import ModalState
 from gcode.profiles import load_setup
 from gcode.reader import Job, read_job
-from gcode.resumption.head import pulled_back_mm
+from gcode.resumption.head import state_at_rest
 from gcode.resumption.rest import rest_without
 from gcode.resumption.standing import standing_field
 from gcode.slicing.job import plan_part
@@ -107,7 +107,7 @@ def whole(job: Job, tmp_path_factory: pytest.TempPathFactory) -> Told:
 def at_the_stop(job: Job) -> tuple[int, list[str], list[str], ModalState]:
     """The line at which it stops, the way to the park and back, and the state there."""
     line = job.layers[LAYER].end_line
-    state = job.state_after(line)
+    state = state_at_rest(job, line)
     aside, parked = park(SETUP, state)
     back = way_back(SETUP, state, parked)
     return (
@@ -146,7 +146,7 @@ def test_what_is_left_of_the_job_is_a_program_that_klipper_takes(
     assert FAILED in Objects.of(job).left
     rest = rest_without(
         job, [FAILED], SETUP, first=line, parked=parked,
-        pulled_mm=pulled_back_mm(job, line) + SETUP.printer.retraction_mm,
+        pulled_mm=parked.pulled_mm,
         standing=standing_field(job.beads, line, SETUP.printer),
     )  # fmt: skip
     lines = job.program.text.split("\n")

@@ -18,6 +18,7 @@ from amrepair.template import MeshSdf
 from gcode.firmware.contact import ProbeContact
 from gcode.moves import ModalState
 from gcode.profiles import load_setup
+from gcode.resumption.head import state_at_rest
 from gcode.surfaces import HeightField
 
 CELL_MM = 0.1
@@ -89,5 +90,5 @@ def judged(scanner: ProbeScanner, run: PreparedRun, site: Site, stop: Stop) -> R
     assert site.build_from_template is not None
     scan = scanner.scan(ScanRequest(stop.label, stop.layer_index, stop.z_mm))
     guess = site.build_from_template.inverse() @ scanner.build_from_scanner
-    _, rest = park(run.setup, run.job.state_after(stop.line))
+    _, rest = park(run.setup, state_at_rest(run.job, stop.line))
     return plan_repair(scan, site, title="a look", guess=guess, interruption=rest, strict=False)

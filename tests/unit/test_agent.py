@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from agent_bench import (
     LAYER_MM,
@@ -35,8 +36,10 @@ from gcode.hosts import PrintReport
 from gcode.hosts.moonraker_job import KlipperJob
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.web import Address
+from gcode.moves import Program
 from gcode.profiles import load_setup
-from gcode.reader import job_for
+from gcode.reader import job_for, read_job
+from gcode.resumption.head import filament_back_mm, state_at_rest
 
 
 @pytest.fixture(scope="module")
@@ -368,7 +371,7 @@ def test_a_layer_that_was_printed_by_us_is_left_out(bench: Bench, followed: Klip
     checked = check(job.program, setup)
     (look,) = marked_stops(job, "job")
     followed.print(checked, lines=range(look.line))
-    own, parked = park(setup, job.state_after(look.line))
+    own, parked = park(setup, state_at_rest(job, look.line))
     followed.print(own)
     before = len(bench.klipper.executed)
     behind = job.layers[LOOK_LAYER + 1].end_line
@@ -388,8 +391,48 @@ def test_nothing_is_printed_once_the_motors_were_let_go(bench: Bench, followed: 
     (look,) = marked_stops(job, "job")
     followed.print(check(job.program, setup), lines=range(look.line))
     bench.klipper.homed = ""  # Klipper's idle_timeout
-    own, _ = park(setup, job.state_after(look.line))
+    own, _ = park(setup, state_at_rest(job, look.line))
     before = len(bench.klipper.executed)
     with pytest.raises(PrinterError, match="the motors were let go while the print rested"):
         followed.print(own)
     assert len(bench.klipper.executed) == before
+
+
+USERS_PAUSE = """\
+[gcode_macro PAUSE]
+rename_existing: BASE_PAUSE
+gcode:
+  BASE_PAUSE
+  M83
+  G1 E-1 F2100
+
+[gcode_macro RESUME]
+rename_existing: BASE_RESUME
+gcode:
+  M83
+  G1 E1 F2100
+  BASE_RESUME
+"""
+
+
+def test_what_the_user_s_pause_pulls_back_is_not_lacking_in_the_repair(bench: Bench) -> None:
+    """Mainsail's and Fluidd's macros pull 1 mm: a patch lacked 2.4 mm³, and a blob was left."""
+    klipper = bench.klipper
+    klipper._config.read_string(USERS_PAUSE)
+    klipper.reset()
+    klipper.cmd_BASE_PAUSE, klipper.cmd_BASE_RESUME = klipper.cmd_PAUSE, klipper.cmd_RESUME
+    bench.agent()
+    assert klipper.print_state == "complete"
+    text = "\n".join(bench.executed()) + "\n"
+    assert text.count("G1 E-1 F2100") == text.count("G1 E1 F2100") == 1
+    job = read_job(Program(text, "klipper"))
+    steps_mm, pushed_mm, _ = job.moves()
+    back_mm = filament_back_mm(job)
+    start = next(k for k, line in enumerate(text.split("\n")) if line == "G1 E-1 F2100")
+    goes = np.hypot(*np.nan_to_num(steps_mm[:, :2]).T) > 0.0
+    later = np.arange(len(goes)) > start
+    laid = later & goes & (pushed_mm > 0.0)
+    assert laid.sum() > 500
+    assert back_mm[:-1][laid].max() < 1e-3  # every bead by a nozzle that is full
+    still = later & ~goes & (pushed_mm > 0.0)
+    assert (pushed_mm - back_mm[:-1])[still].max() < 1e-3  # and nothing in one place

@@ -13,6 +13,7 @@ from gcode.errors import CheckRefusedError
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import read_job
+from gcode.resumption.head import pulled_back_mm, state_at_rest
 
 SETUP = load_setup()
 HEAD = """\
@@ -56,6 +57,32 @@ def test_every_mode_comes_back(relative: bool, absolute_e: bool, inches: bool, t
         assert found.pop(name) == pytest.approx(wanted.pop(name), abs=2e-3), name
     assert found == wanted
     assert "M400" in sent[0]  # the scan waits for the last move
+
+
+@pytest.mark.parametrize("pulled_mm", [0.0, 0.5, 0.8, 6.5])
+def test_whatever_a_job_has_pulled_a_repair_finds_the_nozzle_as_it_leaves_it(
+    pulled_mm: float,
+) -> None:
+    """A job of Cura's rests with 1 mm pulled: patches lacked 2.4 mm³, and its next line got them.
+
+    Marks for looks stand where filament is pulled back, whoever sliced the job.
+    """
+    head = HEAD + (f"G1 E-{pulled_mm} F2100\n" if pulled_mm else "")
+    job = read_job(Program(head, SETUP.printer.dialect))
+    state = state_at_rest(job, head.count("\n"))
+    assert state.pulled_mm == pytest.approx(pulled_mm)
+    program, parked = travel.park(SETUP, state)
+    assert parked.pulled_mm == SETUP.printer.retraction_mm  # what a patch pushes before it lays
+
+    def back_mm(text: str) -> float:
+        return pulled_back_mm(read_job(Program(text, SETUP.printer.dialect)), text.count("\n"))
+
+    there = head + program.program.text
+    assert back_mm(there) == pytest.approx(SETUP.printer.retraction_mm, abs=1e-4)
+    ways = travel.way_back(SETUP, state, parked)
+    assert back_mm(there + "".join(way.program.text for way in ways)) == pytest.approx(
+        pulled_mm, abs=1e-4
+    )
 
 
 def test_filament_that_was_pulled_back_is_pushed_without_melting() -> None:

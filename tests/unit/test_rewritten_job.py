@@ -18,7 +18,7 @@ from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.protocol import command_in
 from gcode.reader import Job, objects_of, read_job
-from gcode.resumption.head import pulled_back_mm
+from gcode.resumption.head import state_at_rest
 from gcode.resumption.rest import Rest, rest_without
 from gcode.resumption.standing import standing_field
 
@@ -42,10 +42,10 @@ def stops(job: Job) -> tuple[Stop, ...]:
 
 def without(job: Job, name: str, line: int, stops: list[int]) -> Rest:
     """As the loop writes it, from where the nozzle rests beside a look."""
-    _, parked = park(SETUP, job.state_after(line))
+    _, parked = park(SETUP, state_at_rest(job, line))
     return rest_without(
         job, [name], SETUP, first=line, parked=parked,
-        pulled_mm=pulled_back_mm(job, line) + SETUP.printer.retraction_mm,
+        pulled_mm=parked.pulled_mm,
         standing=standing_field(job.beads, line, SETUP.printer),
         stops=sorted({*(layer.end_line for layer in job.layers), *stops}),
     )  # fmt: skip
