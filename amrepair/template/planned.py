@@ -121,13 +121,10 @@ class PlannedSdf:
 
     def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and (n, 3) its gradient, by central differences over a voxel."""
-        gradient = np.empty((len(points_mm), 3))
-        for axis in range(3):
-            offset = np.zeros(3)
-            offset[axis] = 0.5 * self.voxel_mm
-            ahead, behind = self.distance(points_mm + offset), self.distance(points_mm - offset)
-            gradient[:, axis] = (ahead - behind) / self.voxel_mm
-        return self.distance(points_mm), gradient
+        points = read_only(points_mm, np.float64)
+        return kernels.interpolate_with_gradient(
+            points, self.origin_mm, self.voxel_mm, self._field
+        )
 
     def below_z(self, z_mm: float) -> Template:
         """The beads printed so far, cut."""

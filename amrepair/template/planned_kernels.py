@@ -42,33 +42,56 @@ def fill(start, end, width, height, origin, voxel, solid):
                         solid[ix, iy, iz] = True
 
 
+@njit(cache=True, nogil=True)
+def _between(x, y, z, origin, voxel, field):
+    """Trilinear between voxel centres; beyond the grid the way to it is added."""
+    gx, gy, gz = (
+        (x - origin[0]) / voxel - 0.5,
+        (y - origin[1]) / voxel - 0.5,
+        (z - origin[2]) / voxel - 0.5,
+    )
+    cx = min(max(gx, 0.0), field.shape[0] - 1 - 1e-9)
+    cy = min(max(gy, 0.0), field.shape[1] - 1 - 1e-9)
+    cz = min(max(gz, 0.0), field.shape[2] - 1 - 1e-9)
+    i, j, k = int(cx), int(cy), int(cz)
+    u, v, w = cx - i, cy - j, cz - k
+    low, high = (1.0 - u) * (1.0 - v), (1.0 - u) * v
+    f = low * (1.0 - w) * field[i, j, k] + low * w * field[i, j, k + 1]
+    f += high * (1.0 - w) * field[i, j + 1, k]
+    f += high * w * field[i, j + 1, k + 1]
+    low, high = u * (1.0 - v), u * v
+    f += low * (1.0 - w) * field[i + 1, j, k]
+    f += low * w * field[i + 1, j, k + 1]
+    f += high * (1.0 - w) * field[i + 1, j + 1, k]
+    f += high * w * field[i + 1, j + 1, k + 1]
+    beyond = ((gx - cx) * voxel) ** 2 + ((gy - cy) * voxel) ** 2 + ((gz - cz) * voxel) ** 2
+    return f + np.sqrt(beyond)
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def interpolate(points, origin, voxel, field):
-    """(n,) trilinear between voxel centres; beyond the grid the way to it is added."""
+    """(n,) of the field at points."""
     out = np.empty(len(points))
-    shape = np.array(field.shape)
-    for k in prange(len(points)):
-        i = np.empty(3, np.int64)
-        t = np.empty(3)
-        beyond = 0.0
-        for a in range(3):
-            g = (points[k, a] - origin[a]) / voxel - 0.5
-            clamped = min(max(g, 0.0), shape[a] - 1 - 1e-9)
-            beyond += ((g - clamped) * voxel) ** 2
-            i[a] = int(clamped)
-            t[a] = clamped - i[a]
-        f = 0.0
-        for c in range(8):
-            dx, dy, dz = c >> 2, (c >> 1) & 1, c & 1
-            weight = (
-                (t[0] if dx else 1.0 - t[0])
-                * (t[1] if dy else 1.0 - t[1])
-                * (t[2] if dz else 1.0 - t[2])
-            )
-            if weight > 0.0:
-                f += weight * field[i[0] + dx, i[1] + dy, i[2] + dz]
-        out[k] = f + np.sqrt(beyond)
+    for p in prange(len(points)):
+        out[p] = _between(points[p, 0], points[p, 1], points[p, 2], origin, voxel, field)
     return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def interpolate_with_gradient(points, origin, voxel, field):
+    """(n,) of the field at points, and (n, 3) its central differences over a voxel."""
+    out, gradient = np.empty(len(points)), np.empty((len(points), 3))
+    half = 0.5 * voxel
+    for p in prange(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        out[p] = _between(x, y, z, origin, voxel, field)
+        ahead = _between(x + half, y, z, origin, voxel, field)
+        gradient[p, 0] = (ahead - _between(x - half, y, z, origin, voxel, field)) / voxel
+        ahead = _between(x, y + half, z, origin, voxel, field)
+        gradient[p, 1] = (ahead - _between(x, y - half, z, origin, voxel, field)) / voxel
+        ahead = _between(x, y, z + half, origin, voxel, field)
+        gradient[p, 2] = (ahead - _between(x, y, z - half, origin, voxel, field)) / voxel
+    return out, gradient
 
 
 @njit(cache=True, nogil=True)
