@@ -14,15 +14,20 @@ from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.as_built import SOLID_MM, Evidence
-from amrepair.frames import box_of, in_box, unit_vectors
+from amrepair.field.near import has_near
+from amrepair.frames import box_of, cells_of, unit_vectors
 from amrepair.observe.rays import rays_crossing
 from amrepair.observe.robust import Problem, solve
+from amrepair.regions import skipped_kernels as kernels
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
+from gcode.compiled import read_only
 from gcode.stretches import in_turn, places_to_ends
 
 LEVEL = 1e-9
+TOGETHER_MM = 0.5  # points in a cell so wide are asked together
+FROM_ABOVE = np.array([1.0, 1.0, 0.0])
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -65,19 +70,19 @@ class PlannedBeads:
 
     def holds(self, points_mm: Points) -> Mask:
         """Which points lie in any of them: beside its line no farther than half its width."""
-        found = np.zeros(len(points_mm), bool)
-        for start, end, width_mm, height_mm in zip(
-            self.start_mm, self.end_mm, self.width_mm, self.height_mm, strict=True
-        ):
-            low_mm, high_mm = np.minimum(start, end), np.maximum(start, end)
-            low_mm, high_mm = low_mm - 0.5 * width_mm, high_mm + 0.5 * width_mm
-            low_mm[2], high_mm[2] = min(start[2], end[2]) - height_mm, max(start[2], end[2])
-            near = np.flatnonzero(~found & in_box(points_mm, low_mm, high_mm))
-            along, off_mm = (end - start)[:2], points_mm[near, :2] - start[:2]
-            share = np.clip(off_mm @ along / max(float(along @ along), LEVEL), 0.0, 1.0)
-            aside_mm = np.linalg.norm(off_mm - share[:, None] * along, axis=1)
-            found[near] = aside_mm <= 0.5 * width_mm
-        return found
+        if not len(points_mm):
+            return np.zeros(0, bool)
+        corner = points_mm[:, :2].min(axis=0)
+        cell = cells_of(points_mm[:, :2], corner, TOGETHER_MM)
+        shape = cell.max(axis=0) + 1
+        number = cell[:, 0] * shape[1] + cell[:, 1]
+        order = np.argsort(number, kind="stable")
+        first = np.searchsorted(number, np.arange(np.prod(shape) + 1), sorter=order)
+        beads = (self.start_mm, self.end_mm, self.width_mm, self.height_mm)
+        return kernels.held(
+            read_only(points_mm), order, first, corner, TOGETHER_MM,
+            (int(shape[0]), int(shape[1])), *(read_only(each) for each in beads),
+        )  # fmt: skip
 
 
 def skipped(
@@ -113,7 +118,7 @@ def skipped(
     if len(ask):
         top_mm = middle[ask] + half_mm[ask, None] * np.array([0.0, 0.0, 1.0])
         width_mm, height_mm = lines.width_mm[line[ask]], lines.height_mm[line[ask]]
-        hanging = _Hanging.of(beads, template, options)
+        hanging = _Hanging.of(beads, top_mm, template, options)
         sunk_mm[ask] = _sunk_mm(top_mm, width_mm, height_mm, hanging, evidence, options)
     middle[:, 2] -= sunk_mm
     rays_mm[ask] = evidence.rays_say(middle[ask])
@@ -132,7 +137,8 @@ def skipped(
         return found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
-    again = (np.abs(high_mm[:, None] - slipped_mm) < options.same_layer_mm).any(axis=1)
+    again = np.abs(high_mm[:, None] - np.unique(slipped_mm)) < options.same_layer_mm
+    again = again.any(axis=1)
     likely = again[line] & (both >= options.gone_again)
     sure |= likely & (surface_says > 0)
     least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
@@ -341,13 +347,18 @@ class _Hanging:
     height_mm: Values
 
     @classmethod
-    def of(cls, beads: PlannedBeads, template: Template, options: SkippedOptions) -> _Hanging:
-        """Where nothing but a sliver of a bead rests on the layer below.
+    def of(
+        cls, beads: PlannedBeads, top_mm: Points, template: Template, options: SkippedOptions
+    ) -> _Hanging:
+        """Where nothing but a sliver of a bead rests on the layer below, about tops of lines.
 
         A line that sticks out of the layer below rests on it by the rest of its width, however far
         the one below that is from reaching there: walls that lean, and what closes over a hole.
         """
         place_mm, which = places_to_ends(beads.start_mm, beads.end_mm, options.look_step_mm)
+        reach_mm = options.sunk_reach_mm + float(beads.width_mm.max(initial=0.0))
+        near = has_near(place_mm * FROM_ABOVE, top_mm * FROM_ABOVE, reach_mm)
+        place_mm, which = place_mm[near], which[near]
         over_mm = (beads.end_mm - beads.start_mm)[:, :2]
         along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
         rests_mm = (0.5 - options.held_share) * beads.width_mm[:, None]
@@ -365,15 +376,15 @@ class _Hanging:
     def under(self, top_mm: Points, options: SkippedOptions) -> Mask:
         """Which tops of lines lie on layers that were laid on it, and hang not themselves."""
         found = np.zeros(len(top_mm), dtype=bool)
-        tree = cKDTree(self.place_mm[:, :2])
-        reach_mm = float(self.width_mm.max(initial=0.0))
-        off_mm = tree.query(top_mm[:, :2], distance_upper_bound=reach_mm)[0]
-        beside = np.flatnonzero(np.isfinite(off_mm))
-        near = tree.query_ball_point(top_mm[beside, :2], reach_mm)
-        for k, others in zip(beside, near, strict=True):
-            layers = (top_mm[k, 2] - self.place_mm[others, 2]) / self.height_mm[others]
-            over = (layers > 0.5) & (layers < options.sunk_layers + 0.5)
-            found[k] = over.any() and not (np.abs(layers) <= 0.5).any()
+        if not len(top_mm) or not len(self.width_mm):
+            return found
+        pairs = cKDTree(top_mm[:, :2]).sparse_distance_matrix(
+            cKDTree(self.place_mm[:, :2]), float(self.width_mm.max()), output_type="ndarray"
+        )
+        top, hanging = pairs["i"], pairs["j"]
+        layers = (top_mm[top, 2] - self.place_mm[hanging, 2]) / self.height_mm[hanging]
+        found[top[(layers > 0.5) & (layers < options.sunk_layers + 0.5)]] = True
+        found[top[np.abs(layers) <= 0.5]] = False
         return found
 
 
@@ -407,10 +418,11 @@ def _sunk_mm(
     )[1]
     lower_mm = top_mm[:, 2:] - np.append(place_mm[:, 2], np.nan)[near]
     mine = np.abs(lower_mm - most_mm[:, None]) < height_mm[:, None]  # not of another layer
-    told = mine.sum(axis=1) >= options.least_sunk_cells
-    here_mm = 0.5 * most_mm
-    lower_mm = np.where(mine, lower_mm, np.nan)[told]
-    here_mm[told] = np.nanquantile(lower_mm, options.sunk_share, axis=1)
+    lower_mm = np.sort(np.where(mine, lower_mm, np.inf), axis=1)
+    here_mm, cells = 0.5 * most_mm, mine.sum(axis=1)
+    for count in range(options.least_sunk_cells, options.sunk_cells + 1):
+        told = cells == count
+        here_mm[told] = np.quantile(lower_mm[told, :count], options.sunk_share, axis=1)
     found_mm[which] = np.clip(here_mm, 0.0, most_mm)
     return found_mm
 

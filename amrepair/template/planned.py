@@ -122,9 +122,7 @@ class PlannedSdf:
     def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance and (n, 3) its gradient, by central differences over a voxel."""
         points = read_only(points_mm, np.float64)
-        return kernels.interpolate_with_gradient(
-            points, self.origin_mm, self.voxel_mm, self._field
-        )
+        return kernels.interpolate_with_gradient(points, self.origin_mm, self.voxel_mm, self._field)
 
     def below_z(self, z_mm: float) -> Template:
         """The beads printed so far, cut."""
