@@ -11,6 +11,7 @@ from amrepair.arrays import Mask, Points, Values, VoxelMask
 from amrepair.deficit.boxes import Box, Sought, boxes_of
 from amrepair.deficit.voxels import VoxelBox, solids_from_field
 from amrepair.field.as_built import SOLID_MM
+from amrepair.field.near import has_near
 from amrepair.frames import in_box
 from amrepair.observe.background import ON_PLANE_MM
 from gcode.progress import Progress
@@ -142,12 +143,12 @@ def _of_a_region(
     high_mm = box.low_mm + box.step_mm * (np.array(box.shape) - 1)
     near = in_box(labelled_mm, box.low_mm, high_mm)
     index = np.round((labelled_mm[near] - box.low_mm) / box.step_mm).astype(np.int64)
-    told = np.zeros(box.shape, bool)
-    told[tuple(index.T)] = True
     shaped = core.reshape(box.shape)
     groups, count = ndimage.label(shaped, structure=np.ones((3, 3, 3), bool))
+    which = np.argwhere(shaped)
+    told = has_near(which * box.step_mm, index * box.step_mm, reach_mm)
     kept = np.zeros(count + 1, bool)
-    kept[groups[shaped & (box.distance_to(told) <= reach_mm)]] = True
+    kept[groups[tuple(which[told].T)]] = True
     return np.asarray(kept[groups].ravel())
 
 
