@@ -39,10 +39,7 @@ from gcode.surfaces import HeightField
 class Standing:
     """Heights that are made when they are first asked for: a clean layer needs none.
 
-    Parameters
-    ----------
-    make
-        Makes them; let go of once it has.
+    What makes them is let go of once it has.
     """
 
     def __init__(self, make: Callable[[], HeightField]) -> None:
@@ -147,8 +144,6 @@ def compute_deficit(
         Height printed so far, build frame; None is the template's own top.
     as_built
         What makes what stands on the bed; None has it made of scan and solids.
-    options
-        How solids and heights are made.
     beads
         What the job has laid there, template frame: lines of it that rays went through are missing,
         however near to the template's surface they lie.

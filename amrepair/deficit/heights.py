@@ -47,10 +47,6 @@ def as_built_heights(
 
     Parameters
     ----------
-    spacing_mm
-        Mean distance between neighbouring points.
-    options
-        How wide its columns are, and how what nobody saw is taken.
     images
         The scan's range images, template frame: what nobody saw, as the bottom of a deep hole, is
         solid no higher than rays crossed it.
@@ -117,14 +113,8 @@ def standing_heights(
     """The as-built field with sharp walls; what is missing from each column; what was wanted.
 
     What was expected, less what is missing, with what is too much, gives heights on a fine grid.
-    They stand beside walls, where the scan saw nothing higher; elsewhere the scan itself decides.
-
-    Parameters
-    ----------
-    seen
-        Heights of the scan, cell by cell (`as_built_heights`).
-    expected, missing, excess
-        Solids, build frame.
+    They stand beside walls, where the scan saw nothing higher (`seen`, by `as_built_heights`);
+    elsewhere the scan itself decides. All is in the build frame.
 
     Returns
     -------
@@ -231,14 +221,7 @@ def with_what_stands_out(
     Solids round off lips, and cells average what is in them: a crest, a splinter or a burr thinner
     than the scan's spacing reads low, by up to its height. No bead can be laid on it, but the head
     may run into it. A point is explained if the field, as near to it as noise moves points aside,
-    is as high. One that is alone is a reflection in mid-air.
-
-    Parameters
-    ----------
-    points_mm
-        What was seen, build frame.
-    spacing_mm
-        Mean distance between neighbouring points.
+    is as high. One that is alone is a reflection in mid-air. Points are in the build frame.
     """
     off_mm = options.off_sigma * sigma_mm
     out = points_mm

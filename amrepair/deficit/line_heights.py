@@ -38,18 +38,14 @@ def standing_in_job(
 ) -> HeightField:
     """The as-built field in mid-job: as seen, without what is missing, with the lines' own walls.
 
+    All is in the build frame.
+
     Parameters
     ----------
-    seen
-        Heights of the scan, cell by cell (`as_built_heights`).
     lines
-        All that the job has laid so far, build frame; None: nobody knows, and cells stay as seen.
-    missing
-        Solid, build frame.
+        All that the job has laid so far; None: nobody knows, and cells stay as seen.
     scan
-        Build frame: what of its points stands out of the field raises it.
-    spacing_mm
-        Mean distance between neighbouring points.
+        What of its points stands out of the field raises it.
     """
     seen = without_missing(seen, missing, options)
     if lines is None or missing.is_empty():
@@ -66,16 +62,8 @@ def standing_lines(
 ) -> HeightField:
     """The as-built field on a fine grid, beside what is missing with the walls of lines laid.
 
-    Elsewhere the scan alone decides, and also there where it saw something higher.
-
-    Parameters
-    ----------
-    seen
-        Heights of the scan, cell by cell (`as_built_heights`).
-    lines
-        All that the job has laid so far, build frame.
-    missing
-        Solid, build frame; not empty.
+    Elsewhere the scan alone decides, and also there where it saw something higher. Something is
+    missing, and all is in the build frame.
     """
     fine = fine_over(seen, options)
     at = cells_over(seen, fine)

@@ -71,8 +71,6 @@ def with_rims(
     ----------
     lost_mm, designed_mm
         How much is missing from each column, from end to end, and the top of what was expected.
-    spacing_mm
-        Mean distance between neighbouring points.
     """
     gone = lost_mm > 0
     if not gone.any():

@@ -1,8 +1,7 @@
+# mypy: disable-error-code="no-untyped-def"
 """Columns beside walls, held against planes through the walls' own points; for `walls`."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -16,23 +15,12 @@ STEEPEST_CELL_MM = 0.15
 
 
 @njit(cache=True, nogil=True)
-def plane_of(
-    x: float,
-    y: float,
-    iy: int,
-    ix: int,
-    high: float,
-    low: float,
-    start: Any,
-    points: Any,
-    reach: int,
-    radius: float,
-) -> Any:
+def plane_of(x, y, iy, ix, high, low, start, points, reach, radius):
     """(7,) of the points within a radius and two heights: mean, normal and spread along it.
 
     `points` (n, 3) are sorted by cell, `start` (ny, nx + 1) says where those of each cell begin.
     Spread is infinite where there are too few, or they are all on one line.
-    """  # fmt: skip
+    """
     ny, nx = start.shape[0], start.shape[1] - 1
     found = np.zeros(7)
     found[6] = np.inf
@@ -65,24 +53,13 @@ def plane_of(
 
 @njit(cache=True, nogil=True)
 def sharpened(
-    z: Any,
-    iy: Any,
-    ix: Any,
-    start: Any,
-    points: Any,
-    origin: Any,
-    cell: float,
-    radius: float,
-    below_top: float,
-    over_foot: float,
-    most_spread: float,
-    most_slant: float,
-) -> Any:
+    z, iy, ix, start, points, origin, cell, radius, below_top, over_foot, most_spread, most_slant
+):
     """(q,) heights of the columns asked about, (q,) `iy` and `ix`.
 
     A column whose middle lies inside the plane of the wall beside it, at its top and at its foot,
     is as high as what stands around; outside, as low.
-    """  # fmt: skip
+    """
     ny, nx = z.shape
     out = np.empty(len(iy))
     reach = int(np.ceil(radius / cell))
@@ -132,7 +109,7 @@ def sharpened(
 
 
 @njit(cache=True, nogil=True)
-def extended(z: Any, iy: Any, ix: Any, sound: Any, reach: int, least: int, spread: float) -> Any:
+def extended(z, iy, ix, sound, reach, least, spread):
     """(q,) heights of the columns asked about, on planes through what is sound around each.
 
     `iy`, `ix` (q,); `sound` (ny, nx): columns that a plane goes through, within `reach` cells and

@@ -1,8 +1,7 @@
+# mypy: disable-error-code="no-untyped-def"
 """Points moved onto the planes through their neighbours; compiled, for `faces`."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True)
-def plane_through(points: Any, index: Any, weight: Any, mean: Any, normal: Any) -> None:
+def plane_through(points, index, weight, mean, normal):
     """Mean of some points by weight, and normal of the plane through them, into the last two."""
     total = 0.0
     mean[:] = 0.0
@@ -23,11 +22,8 @@ def plane_through(points: Any, index: Any, weight: Any, mean: Any, normal: Any) 
         mean[a] /= total
     xx = xy = xz = yy = yz = zz = 0.0
     for k in range(len(index)):
-        x, y, z = (
-            points[index[k], 0] - mean[0],
-            points[index[k], 1] - mean[1],
-            points[index[k], 2] - mean[2],
-        )
+        at = points[index[k]]
+        x, y, z = at[0] - mean[0], at[1] - mean[1], at[2] - mean[2]
         xx += weight[k] * x * x
         xy += weight[k] * x * y
         xz += weight[k] * x * z
@@ -38,7 +34,7 @@ def plane_through(points: Any, index: Any, weight: Any, mean: Any, normal: Any) 
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def smoothed(points: Any, index: Any, rounds: int, spread: float, least_spread: float) -> Any:
+def smoothed(points, index, rounds, spread, least_spread):
     """(n, 3) points on the planes through their neighbours, (n, 3) those planes' normals.
 
     At an edge one of two planes wins: in each round what lies far from the plane counts less.
@@ -68,17 +64,7 @@ def smoothed(points: Any, index: Any, rounds: int, spread: float, least_spread: 
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def plane_values(
-    points: Any,
-    f: Any,
-    distance: Any,
-    index: Any,
-    place: Any,
-    deviation: Any,
-    off: Any,
-    normal: Any,
-    blur: float,
-) -> Any:
+def plane_values(points, f, distance, index, place, deviation, off, normal, blur):
     """(n,) signed distance by the nearest places, weighted, and how high above the nearest alone.
 
     `distance` and `index` (n, k) are of the nearest places, those `off` the template planes.

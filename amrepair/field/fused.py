@@ -159,9 +159,9 @@ def make_surfels(
     )
 
 
-def estimate_spacing(points_mm: Points, options: SurfelOptions = USUAL_SURFELS) -> float:
+def estimate_spacing(points_mm: Points) -> float:
     """Mean spacing of a surface cloud from how many 1 mm (or larger) cells it occupies."""
-    return _spacing(points_mm, np.ones(len(points_mm), bool), box_of(points_mm), options)
+    return _spacing(points_mm, np.ones(len(points_mm), bool), box_of(points_mm), USUAL_SURFELS)
 
 
 def _spacing(

@@ -1,8 +1,7 @@
+# mypy: disable-error-code="no-untyped-def"
 """Which places have points beside them; compiled, for `near`."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -10,7 +9,7 @@ from gcode.compiled import njit, prange
 
 
 @njit(cache=True, nogil=True)
-def by_cell(asked: Any, points: Any, low: Any, cell: float, shape: Any) -> Any:
+def by_cell(asked, points, low, cell, shape):
     """Where the points of each cell begin and the last one's end; points and numbers so ordered.
 
     Cells are numbered x-major in a box of `shape` cells, an empty layer about all places that are
@@ -54,17 +53,7 @@ def by_cell(asked: Any, points: Any, low: Any, cell: float, shape: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def beside(
-    asked: Any,
-    start: Any,
-    ordered: Any,
-    number: Any,
-    low: Any,
-    cell: float,
-    shape: Any,
-    within: float,
-    enough: int,
-) -> Any:
+def beside(asked, start, ordered, number, low, cell, shape, within, enough):
     """(k,) number of the point nearest to each place, −1 where none is within a distance.
 
     And (k,) how many are; no more are looked at than are `enough`. The distance is at most a
@@ -80,12 +69,9 @@ def beside(
             x, y = ix - 1 + line // 3, iy - 1 + line % 3
             first = (x * shape[1] + y) * shape[2] + iz - 1
             for p in range(start[first], start[first + 3]):
-                dx, dy, dz = (
-                    ordered[p, 0] - asked[k, 0],
-                    ordered[p, 1] - asked[k, 1],
-                    ordered[p, 2] - asked[k, 2],
-                )
-                apart = dx * dx + dy * dy + dz * dz
+                apart = 0.0
+                for a in range(3):
+                    apart += (ordered[p, a] - asked[k, a]) ** 2
                 if apart > within * within:
                     continue
                 count[k] += 1

@@ -172,8 +172,6 @@ def find_occupancy(
         Points of the scan that lie on the template.
     surface
         Places evenly spread on the template's surface, and outward unit normals.
-    spacing_mm
-        Of the scan.
     """
     if len(broken.f_mm) == 0:
         none = np.zeros((0, 0, 0), bool)

@@ -99,8 +99,6 @@ def scales_of(
     place_mm, normal, value_mm, weight
         Of the field's cells: places, outward unit normals of the template, deviations and numbers
         of observations.
-    cell_mm
-        Edge of the field's own cells.
     widest_mm
         No window is wider than this, but for the first scale's.
     """

@@ -5,7 +5,6 @@ residual pose, scale, bow and offsets between views are fitted, told and taken o
 left is for the rooms above to judge.
 """
 
-from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 
-__all__ = ["Nuisance", "NuisanceOptions", "fit_nuisance"]
+__all__ = ["Nuisance", "fit_nuisance"]

@@ -51,6 +51,10 @@ class NuisanceOptions:
     support_p: float = 0.01
 
 
+USUAL_NUISANCE = NuisanceOptions()
+"""What every fit goes by."""
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """Centre, principal axes (rows, the longest first) and half extents of what was seen."""
@@ -93,7 +97,7 @@ def shape_columns(place_mm: Points, normal: Points, frame: Frame) -> Float[np.nd
 
 
 def priors(
-    half_extent_mm: Float[np.ndarray, " 3"], views: int, options: NuisanceOptions
+    half_extent_mm: Float[np.ndarray, " 3"], views: int
 ) -> tuple[Float[np.ndarray, "p q"], dict[str, Int[np.ndarray, " ..."]]]:
     """Return the unknowns' sizes for unknowns in units of their priors, and which are one term.
 
@@ -101,6 +105,7 @@ def priors(
     its length, and towards zero where the part is as thick as it is long. Offsets of views are
     what they have in common and what they differ by, each with its own prior.
     """
+    options = USUAL_NUISANCE
     h = half_extent_mm / max(float(half_extent_mm[0]), 1e-9)
     slender = [h[i] ** 2 * (1 - (h[j] / max(h[i], 1e-9)) ** 2) for i, j in BOWS]
     bow = options.bow_sigma_mm * np.maximum([*slender, h[1] * slender[2] / max(h[1], 1e-9)], 0.0)

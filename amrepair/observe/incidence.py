@@ -19,8 +19,6 @@ def incidence(normal: Points, to_sensor: Points | None) -> Values:
 
     Parameters
     ----------
-    normal
-        Outward unit normals of the template.
     to_sensor
         Ways to what saw each place; None: of a single view they are told by what it faces.
     """

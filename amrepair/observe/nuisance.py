@@ -18,9 +18,9 @@ from amrepair.errors import InputError
 from amrepair.observe.basis import (
     BOW_AT,
     SCALE_AT,
+    USUAL_NUISANCE,
     VIEWS_AT,
     Frame,
-    NuisanceOptions,
     priors,
     shape_columns,
 )
@@ -29,7 +29,6 @@ from amrepair.observe.robust import Problem, Solution, covariance, solve, starts
 
 CELLS_ACROSS = 48  # a nuisance is smooth: cells finer than this say nothing more about it
 STATIONS = np.linspace(-1, 1, 21)  # from end to end of an axis
-USUAL_NUISANCE = NuisanceOptions()
 BESIDE_RATIO = 0.1  # a bow along one axis alone is told with that axis's length
 
 
@@ -62,8 +61,6 @@ class Nuisance:
         Share of the observations that the fit believed; the rest is defects and outliers.
     independent
         How many independent observations there were.
-    options
-        The priors.
     """
 
     frame: Frame
@@ -76,17 +73,11 @@ class Nuisance:
     supported: tuple[str, ...]
     used_ratio: float
     independent: float
-    options: NuisanceOptions
 
     def removed_mm(self, place_mm: Points, normal: Points, view: Numbers | None = None) -> Values:
         """Return the part of the deviation that is nuisance, to be subtracted.
 
-        Parameters
-        ----------
-        place_mm, normal
-            (s, 3) in the template's frame.
-        view
-            (s,) which view saw it; None takes what the views have in common.
+        `view` (s,) is which view saw it; None takes what the views have in common.
         """
         shape = shape_columns(place_mm, normal, self.frame)
         removed_mm = shape @ np.r_[self.twist, self.scale_ratio, self.bow_mm]
@@ -107,22 +98,22 @@ class Nuisance:
 
     def _told_pose(self) -> list[str]:
         moved_mm, turned = np.linalg.norm(self.twist[:3]), np.linalg.norm(self.twist[3:])
-        far = moved_mm > self.options.told_sigma * self.options.pose_translation_sigma_mm
-        if far or turned > self.options.told_sigma * self.options.pose_rotation_sigma_rad:
+        far = moved_mm > USUAL_NUISANCE.told_sigma * USUAL_NUISANCE.pose_translation_sigma_mm
+        if far or turned > USUAL_NUISANCE.told_sigma * USUAL_NUISANCE.pose_rotation_sigma_rad:
             degrees = np.degrees(turned)
             return [f"It lies {moved_mm:.2f} mm and {degrees:.2f}° from where it was laid."]
         return []
 
     def _told_scale(self) -> list[str]:
-        prior = self.options.scale_sigma_ratio
-        if abs(self.scale_ratio) <= self.options.told_sigma * prior:
+        prior = USUAL_NUISANCE.scale_sigma_ratio
+        if abs(self.scale_ratio) <= USUAL_NUISANCE.told_sigma * prior:
             return []
         word = "small" if self.scale_ratio < 0 else "large"
         percent = 100 * abs(self.scale_ratio)
         return [f"The part is {percent:.1f} % {word} (prior {100 * prior:.1f} %)."]
 
     def _told_bow(self) -> list[str]:
-        prior_mm = self.options.bow_sigma_mm
+        prior_mm = USUAL_NUISANCE.bow_sigma_mm
         length = [f"{2 * half_mm:.0f}" for half_mm in self.frame.half_extent_mm]
         sags = np.abs(self.bow_mm[1:3])
         flatness_mm = self.flatness_mm
@@ -130,7 +121,7 @@ class Nuisance:
         over = length[int(np.argmax(sags))] if alone else f"{length[0]} × {length[1]}"
         told = []
         for bow_mm, where in ((flatness_mm, over), (abs(self.bow_mm[0]), length[0])):
-            if bow_mm > self.options.told_sigma * prior_mm:
+            if bow_mm > USUAL_NUISANCE.told_sigma * prior_mm:
                 told.append(f"It is bent by {bow_mm:.2f} mm over {where} mm (prior {prior_mm} mm).")
         return told
 
@@ -142,7 +133,7 @@ class Nuisance:
         return float(np.ptp(along_mm))
 
     def _told_views(self) -> list[str]:
-        offset, options = self.view_offset_mm, self.options
+        offset, options = self.view_offset_mm, USUAL_NUISANCE
         told: list[str] = []
 
         def tell(lies: str, off_mm: float, prior_mm: float, beside: str) -> None:
@@ -195,7 +186,6 @@ def fit_nuisance(
     view: Numbers | None = None,
     tolerance_mm: float,
     correlation_mm: float,
-    options: NuisanceOptions = USUAL_NUISANCE,
 ) -> Nuisance:
     """Fit what is common to the whole part or to a whole view.
 
@@ -215,8 +205,6 @@ def fit_nuisance(
         What a sound part may deviate by: larger deviations soon lose their say.
     correlation_mm
         Distance over which the errors' correlation falls to 1/e; 0 where they are independent.
-    options
-        The priors.
 
     Raises
     ------
@@ -239,8 +227,8 @@ def fit_nuisance(
     frame = Frame.of(cells.place_mm)
     shape = shape_columns(cells.place_mm, cells.normal, frame)
     columns = np.column_stack([shape, cells.view[:, None] == np.arange(views)]).astype(float)
-    physical, terms = priors(frame.half_extent_mm, views, options)
-    solution, kept, spread = _supported(columns @ physical, terms, cells, tolerance_mm, options)
+    physical, terms = priors(frame.half_extent_mm, views)
+    solution, kept, spread = _supported(columns @ physical, terms, cells, tolerance_mm)
     on = physical[:, kept]
     value = on @ solution.unknown
     return Nuisance(
@@ -254,7 +242,6 @@ def fit_nuisance(
         supported=tuple(name for name, at in terms.items() if name != "pose" and kept[at].all()),
         used_ratio=float(cells.share @ solution.weight / cells.share.sum()),
         independent=float(cells.share.sum()),
-        options=options,
     )
 
 
@@ -263,7 +250,6 @@ def _supported(
     terms: dict[str, Int[np.ndarray, " ..."]],
     cells: Cells,
     tolerance_mm: float,
-    options: NuisanceOptions,
 ) -> tuple[Solution, np.ndarray, Float[np.ndarray, "k k"]]:
     """Fit all terms, then leave out the one with the least evidence as long as it is too little.
 
@@ -284,7 +270,7 @@ def _supported(
             if name != "pose" and kept[at].all()
         }
         weakest = max(chance, key=chance.__getitem__, default="")
-        if not weakest or chance[weakest] < options.support_p:
+        if not weakest or chance[weakest] < USUAL_NUISANCE.support_p:
             return solution, kept, spread
         stay = np.delete(np.arange(int(kept.sum())), place[terms[weakest]])
         starts = (solution.unknown[stay],)

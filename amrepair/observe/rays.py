@@ -104,11 +104,7 @@ def clearances(
 
 
 def rays_crossing(
-    scan: Scan,
-    near_mm: Float[np.ndarray, "a 2"],
-    within_mm: float,
-    height_mm: float,
-    top_mm: float,
+    scan: Scan, near_mm: Float[np.ndarray, "a 2"], within_mm: float, height_mm: float, top_mm: float
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2"]]:
     """Points below `top_mm` whose rays cross a height near some places; and where they do.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amrepair.arrays import Mask, Numbers, Values
-from amrepair.observe.basis import NuisanceOptions
+from amrepair.observe.basis import USUAL_NUISANCE
 from amrepair.observe.robust import MAD_TO_SIGMA
 
 LEAST_PLACES = 30  # that a view shares with others: fewer tell nothing of it
@@ -84,10 +84,10 @@ class Contradiction:
         return {"view": self.view + 1, "apart_mm": self.apart_mm, "places": self.places}
 
 
-def contradictions(
-    shares: Shares, *, point_sigma_mm: float, options: NuisanceOptions
-) -> tuple[Contradiction, ...]:
+def contradictions(shares: Shares, *, point_sigma_mm: float) -> tuple[Contradiction, ...]:
     """Views to leave out, the worst first, until the rest agree.
+
+    They contradict each other beyond `told_sigma` times what views differ by, and the noise.
 
     Parameters
     ----------
@@ -95,10 +95,9 @@ def contradictions(
         Without what belongs to the whole part or to a whole view.
     point_sigma_mm
         Standard deviation of one point about its neighbours.
-    options
-        Beyond `told_sigma` times what views differ by, and the noise, they contradict each other.
     """
     found: list[Contradiction] = []
+    options = USUAL_NUISANCE
     told = shares.gathered()
     while True:
         points, place = told.count, told.place

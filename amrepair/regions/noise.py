@@ -71,8 +71,6 @@ def noise_of(
     ----------
     levels
         The first scale's third deviations and medians, then every wider scale's medians.
-    shares
-        What each view says; None where views are not known.
     profile_mm
         The scanner's own word on its noise, where the scan has too few cells to tell.
     """

@@ -51,11 +51,7 @@ class Tested:
 
 
 def find_regions(
-    evidence: Evidence,
-    test: Tested,
-    surface_mm: Points,
-    surface_label: Numbers,
-    template: Template,
+    evidence: Evidence, test: Tested, surface_mm: Points, surface_label: Numbers, template: Template
 ) -> tuple[Region, ...]:
     """Regions of both kinds, largest first."""
     s = evidence.surfels

@@ -167,13 +167,7 @@ def as_student(z: float, freedom: Values) -> Values:
 def tested(
     sites: Sites, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Level, ...]:
-    """Test every scale's medians, and the third deepest and highest cells of the first.
-
-    Parameters
-    ----------
-    calibration
-        What sound parts look like to this scanner; None: as the scan itself tells.
-    """
+    """Test every scale's medians, and the third deepest and highest cells of the first."""
     scales = scales_of(
         sites.place_mm,
         sites.normal,

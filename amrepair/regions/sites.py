@@ -17,7 +17,6 @@ from amrepair.field.groups import cell_numbers
 from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import cells_of, diagonal, unit_vectors
 from amrepair.observe.background import ON_PLANE_MM, background
-from amrepair.observe.basis import NuisanceOptions
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
@@ -186,10 +185,7 @@ def _crossed(
 
 
 def sites_of(
-    seen: Observed,
-    options: RegionOptions,
-    top_z_mm: float | None,
-    rounded_up: RoundedUp | None,
+    seen: Observed, options: RegionOptions, top_z_mm: float | None, rounded_up: RoundedUp | None
 ) -> Sites:
     """Cells and crossed template points, each with what a sound part may depart there."""
     surfels, template, outward = seen.surfels, seen.template, seen.outward
@@ -293,11 +289,8 @@ def agreed(
             return seen, sites, nuisance, out
         feet_mm = sites.place_mm[: sites.cells]
         place = cell_numbers(cells_of(feet_mm, 0.0, sites.cell_mm))[shares.place]
-        out = contradictions(
-            replace(shares, place=place),
-            point_sigma_mm=seen.surfels.spread_mm,
-            options=NuisanceOptions(),
-        )
+        told = replace(shares, place=place)
+        out = contradictions(told, point_sigma_mm=seen.surfels.spread_mm)
         if not out:
             return seen, sites, nuisance, out
 

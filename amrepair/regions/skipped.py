@@ -6,7 +6,7 @@ tells that it is gone; along the line, looks at its own middle do. What follows 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,7 +27,7 @@ from gcode.stretches import in_turn, places_to_ends
 
 LEVEL = 1e-9
 TOGETHER_MM = 0.5  # points in a cell so wide are asked together
-FROM_ABOVE = np.array([1.0, 1.0, 0.0])
+UP, FROM_ABOVE = np.array([0.0, 0.0, 1.0]), np.array([1.0, 1.0, 0.0])
 RECENT_MM = 1.0  # below the highest: what lies deeper is under other beads
 
 
@@ -100,32 +100,18 @@ def skipped(
         What the job has laid last, template frame.
     scan
         In the template's frame, its sensors known; without rays nothing is said.
-    evidence
-        Of this scan.
     """
     paths = _Paths.of(beads, options)
     lines, line = paths.lines, paths.line
     if not evidence.has_rays or not len(line):
         return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
-    half_mm = 0.5 * lines.height_mm[line]
-    middle = lines.start_mm[line] + paths.share[:, None] * (lines.end_mm - lines.start_mm)[line]
-    middle[:, 2] -= half_mm
     # rays alone cost little; only where they say "open" walls and surfaces are asked, too
-    rays_mm = evidence.rays_say(middle)
-    ask = np.flatnonzero(rays_mm > 0)
-    middle[ask] += _wall_shift(middle[ask], evidence, template, options)
-    sunk_mm = np.zeros(len(line))
-    if len(ask):
-        top_mm = middle[ask] + half_mm[ask, None] * np.array([0.0, 0.0, 1.0])
-        width_mm, height_mm = lines.width_mm[line[ask]], lines.height_mm[line[ask]]
-        hanging = _Hanging.of(beads, top_mm, template, options)
-        sunk_mm[ask] = _sunk_mm(top_mm, width_mm, height_mm, hanging, evidence, options)
-    middle[:, 2] -= sunk_mm
-    rays_mm[ask] = evidence.rays_say(middle[ask])
-    ask = ask[rays_mm[ask] > 0]
-    by_surface, by_both = _shares(
-        middle, half_mm, ask, rays_mm, sunk_mm, paths, scan, evidence, template, options
-    )
+    ask = np.flatnonzero(evidence.rays_say(paths.middles_mm) > 0)
+    looks = _Looks.of(paths, ask, beads, evidence, template, options)
+    ask, looks = ask[looks.rays_mm > 0], looks.some(looks.rays_mm > 0)
+    by_surface = np.full(len(line), -1.0)
+    by_both = by_surface.copy()
+    by_surface[ask], by_both[ask] = _shares(looks, scan, evidence, template, options)
     surface_says = _together(by_surface, paths.path, options.looks_together)
     sure = surface_says >= options.gone_share
     both = _together(by_both, paths.path, options.looks_together)
@@ -137,8 +123,8 @@ def skipped(
         return found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
-    again = np.abs(high_mm[:, None] - np.unique(slipped_mm)) < options.same_layer_mm
-    again = again.any(axis=1)
+    off_mm = np.abs(high_mm[:, None] - np.unique(slipped_mm))
+    again = (off_mm < options.same_layer_mm).any(axis=1)
     likely = again[line] & (both >= options.gone_again)
     sure |= likely & (surface_says > 0)
     least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
@@ -193,6 +179,15 @@ class _Paths:
         line = np.searchsorted(ends_mm[1:], at_mm)
         share = (at_mm - ends_mm[line]) / length_mm[line]
         return cls(lines, ends_mm, of, at_mm, step_mm, line, share)
+
+    @property
+    def middles_mm(self) -> Points:
+        """(m, 3) middles of the lines where the looks are."""
+        lines, line = self.lines, self.line
+        over_mm = (lines.end_mm - lines.start_mm)[line]
+        middle_mm = lines.start_mm[line] + self.share[:, None] * over_mm
+        middle_mm[:, 2] -= 0.5 * lines.height_mm[line]
+        return middle_mm
 
     def kept(self, gone: Mask, sure: Mask, least_mm: Values) -> Mask:
         """Neighbouring looks that say so, over a length, of which one is sure."""
@@ -249,6 +244,54 @@ class _Paths:
         return replace(
             lines, start_mm=lines.start_mm + low * over, end_mm=lines.start_mm + high * over
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _Looks:
+    """Looks at lines of which rays say that they are open.
+
+    Attributes
+    ----------
+    middle_mm
+        (k, 3) the line's middle, as its walls stand and as low as it was laid.
+    half_mm, width_mm, along
+        (k,) half its height, its width, and (k, 2) its way as seen from above.
+    sunk_mm
+        (k,) how much lower than its layer it was laid.
+    rays_mm
+        (k,) how far in the open rays say that the middle lies.
+    """
+
+    middle_mm: Points
+    half_mm: Values
+    width_mm: Values
+    along: Float[np.ndarray, "k 2"]
+    sunk_mm: Values
+    rays_mm: Values
+
+    @classmethod
+    def of(
+        cls, paths: _Paths, ask: Numbers, beads: PlannedBeads, evidence: Evidence,
+        template: Template, options: SkippedOptions,
+    ) -> _Looks:  # fmt: skip
+        """Some of the looks along paths."""
+        lines, line = paths.lines, paths.line[ask]
+        half_mm, width_mm = 0.5 * lines.height_mm[line], lines.width_mm[line]
+        over_mm = (lines.end_mm - lines.start_mm)[line, :2]
+        along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
+        middle_mm, sunk_mm = paths.middles_mm[ask], np.zeros(len(ask))
+        if len(ask):
+            middle_mm += _wall_shift(middle_mm, evidence, template, options)
+            top_mm = middle_mm + half_mm[:, None] * UP
+            hanging = _Hanging.of(beads, top_mm, template, options)
+            sunk_mm = _sunk_mm(top_mm, width_mm, 2.0 * half_mm, hanging, evidence, options)
+            middle_mm[:, 2] -= sunk_mm
+        rays_mm = evidence.rays_say(middle_mm)
+        return cls(middle_mm, half_mm, width_mm, along, sunk_mm, rays_mm)
+
+    def some(self, which: Mask | Int[np.ndarray, " q"]) -> _Looks:
+        """Some of them."""
+        return _Looks(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 def _wall_shift(
@@ -364,7 +407,7 @@ class _Hanging:
         rests_mm = (0.5 - options.held_share) * beads.width_mm[:, None]
         aside_mm = (rests_mm * along[:, ::-1] * np.array([-1.0, 1.0]))[which]
         width_mm, height_mm = beads.width_mm[which], beads.height_mm[which]
-        below_mm = place_mm - 1.5 * height_mm[:, None] * np.array([0.0, 0.0, 1.0])
+        below_mm = place_mm - 1.5 * height_mm[:, None] * UP
         # lower lies the bed, or what nobody knows
         hangs = np.flatnonzero(below_mm[:, 2] > template.bounds_mm[0, 2])
         for side in (0.0, -1.0, 1.0):
@@ -428,69 +471,47 @@ def _sunk_mm(
 
 
 def _shares(
-    middle_mm: Points,
-    half_mm: Values,
-    ask: Int[np.ndarray, " a"],
-    rays_mm: Values,
-    sunk_mm: Values,
-    paths: _Paths,
-    scan: Scan,
-    evidence: Evidence,
-    template: Template,
-    options: SkippedOptions,
+    looks: _Looks, scan: Scan, evidence: Evidence, template: Template, options: SkippedOptions
 ) -> tuple[Values, Values]:
-    """(m,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
+    """(k,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
 
     Where a line hangs, the floor below it is where it should be whether the line is there or not,
     and planes and pixels are wider than the gaps beside it: there each ray tells for itself. What
     nobody looked into is there.
     """
-    by_surface = np.full(len(middle_mm), -1.0)
-    by_both = by_surface.copy()
-    told_mm = evidence.clearance(middle_mm[ask], template.distance(middle_mm[ask]))[0]
-    looked_into = told_mm > SOLID_MM + 1e-6
-    known = ask[looked_into]
-    half = half_mm[known]
-    surface = np.clip(told_mm[looked_into] / half, -1.0, 1.0)
-    rays = np.clip(rays_mm[known] / half, -1.0, options.most_share)
-    width_mm = paths.lines.width_mm[paths.line[known]]
-    topped = _topped(middle_mm[known], half, width_mm, evidence, options)
-    below_mm = middle_mm[known] - 2.0 * half[:, None] * np.array([0.0, 0.0, 1.0])
-    asked = np.flatnonzero(~topped & (surface < 0))
-    asked = asked[(sunk_mm[known[asked]] == 0) & (template.distance(below_mm[asked]) > 0)]
-    went = _went_through(known[asked], middle_mm, half_mm, paths, scan, options)
-    told = np.flatnonzero(np.isfinite(went))
-    surface[asked[told]] = rays[asked[told]] = went[told]
+    told_mm = evidence.clearance(looks.middle_mm, template.distance(looks.middle_mm))[0]
+    known = told_mm > SOLID_MM + 1e-6
+    told_mm, seen = told_mm[known], looks.some(known)
+    surface = np.clip(told_mm / seen.half_mm, -1.0, 1.0)
+    rays = np.clip(seen.rays_mm / seen.half_mm, -1.0, options.most_share)
+    topped = _topped(seen, evidence, options)
+    below_mm = seen.middle_mm - 2.0 * seen.half_mm[:, None] * UP
+    asked = np.flatnonzero(~topped & (surface < 0) & (seen.sunk_mm == 0))
+    asked = asked[template.distance(below_mm[asked]) > 0]
+    went = _went_through(seen.some(asked), scan, options)
+    told = asked[np.isfinite(went)]
+    surface[told] = rays[told] = went[np.isfinite(went)]
+    by_surface, by_both = np.full((2, len(known)), -1.0)
     by_surface[known] = surface
     by_both[known] = np.where(topped, -1.0, 0.5 * (surface + rays))
     return by_surface, by_both
 
 
-def _went_through(
-    which: Int[np.ndarray, " a"],
-    middle_mm: Points,
-    half_mm: Values,
-    paths: _Paths,
-    scan: Scan,
-    options: SkippedOptions,
-) -> Float[np.ndarray, " a"]:
-    """(a,) of the rays that met the core of a line how many more went on than ended: −1 to 1.
+def _went_through(looks: _Looks, scan: Scan, options: SkippedOptions) -> Float[np.ndarray, " k"]:
+    """(k,) of the rays that met the core of a line how many more went on than ended: −1 to 1.
 
     One that went on ended a line's height below its middle or deeper; what hangs lower than it
     should is there. NaN where none came. A ray counts where it crosses the height of the line's
     middle, however far aside the floor lies that it saw: between strands that hang apart slanting
     rays see all of what is under them.
     """
-    lines = paths.lines
-    over_mm = (lines.end_mm - lines.start_mm)[paths.line[which], :2]
-    along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
-    core_mm = options.under_share * lines.width_mm[paths.line[which]]
+    core_mm = options.under_share * looks.width_mm
     reach_mm = float(np.hypot(core_mm.max(initial=0.0), 0.5 * options.look_step_mm))
-    on, ended = np.zeros(len(which)), np.zeros(len(which))
-    height_mm = np.round(middle_mm[which, 2], 6)
+    on, ended = np.zeros((2, len(core_mm)))
+    height_mm = np.round(looks.middle_mm[:, 2], 6)
     for z_mm in np.unique(height_mm):
         mine = np.flatnonzero(height_mm == z_mm)
-        place_mm, thick_mm = middle_mm[which[mine]], 2.0 * half_mm[which[mine]]
+        place_mm, thick_mm = looks.middle_mm[mine], 2.0 * looks.half_mm[mine]
         came, crossing_mm = rays_crossing(
             scan, place_mm[:, :2], reach_mm, z_mm, z_mm + float(thick_mm.max())
         )
@@ -498,29 +519,24 @@ def _went_through(
         met = near < len(mine)
         near, crossing_mm, points_mm = near[met], crossing_mm[met], scan.points_mm[came[met]]
         off_mm = crossing_mm - place_mm[near, :2]
-        x, y = along[mine[near]].T
+        x, y = looks.along[mine[near]].T
         in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[near]]
         deep_mm = (z_mm - points_mm[:, 2]) / thick_mm[near]
-        on += np.bincount(mine[near[in_core & (deep_mm > 1.0)]], minlength=len(which))
+        on += np.bincount(mine[near[in_core & (deep_mm > 1.0)]], minlength=len(on))
         there = in_core & (np.abs(deep_mm) <= 1.0)
-        ended += np.bincount(mine[near[there]], minlength=len(which))
+        ended += np.bincount(mine[near[there]], minlength=len(on))
     with np.errstate(invalid="ignore"):
         return np.asarray((on - ended) / (on + ended))
 
 
-def _topped(
-    middle_mm: Points,
-    half_mm: Values,
-    width_mm: Values,
-    evidence: Evidence,
-    options: SkippedOptions,
-) -> Mask:
+def _topped(looks: _Looks, evidence: Evidence, options: SkippedOptions) -> Mask:
     """Looks at which something was seen at the line's own top: there it is, however rounded."""
-    top_mm = middle_mm + half_mm[:, None] * np.array([0.0, 0.0, 1.0])
+    half_mm = looks.half_mm[:, None]
+    top_mm = looks.middle_mm + half_mm * UP
     distance, near = evidence.surfels.tree.nearest(top_mm, options.about)
     low_mm = np.abs(top_mm[:, 2:] - evidence.surfels.place_mm[near, 2])
-    at_top = (distance < 0.5 * width_mm[:, None]) & (low_mm < options.top_share * half_mm[:, None])
-    return np.asarray(at_top.any(axis=1))
+    beside = distance < 0.5 * looks.width_mm[:, None]
+    return np.asarray((beside & (low_mm < options.top_share * half_mm)).any(axis=1))
 
 
 def _together(value: Values, path: Numbers, together: int) -> Values:

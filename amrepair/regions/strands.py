@@ -25,12 +25,7 @@ SEEN = 0.5
 
 
 def on_strands(
-    surfels: Surfels,
-    template: Template,
-    maybe: Mask,
-    *,
-    systematic_mm: float,
-    noise_mm: float,
+    surfels: Surfels, template: Template, maybe: Mask, *, systematic_mm: float, noise_mm: float
 ) -> Mask:
     """(n,) cells that lie on a strip whose mean deviation outwards is over its limit.
 

@@ -263,7 +263,9 @@ def test_rays_alone_do_not_tell_of_another_line_nor_of_more_of_the_same(
 
     monkeypatch.setattr(Evidence, "rays_say", rays)
     monkeypatch.setattr(Evidence, "clearance", surface)
-    monkeypatch.setattr("amrepair.regions.skipped._topped", lambda middle, *rest: middle[:, 0] < 0)
+    monkeypatch.setattr(
+        "amrepair.regions.skipped._topped", lambda looks, *rest: looks.middle_mm[:, 0] < 0
+    )
     found = gone_of(scan_of(without(4.0, 9.0, 0, 2 * HIGH_MM), 0))
     assert len(found.width_mm)
     assert (found.end_mm[:, 0] < 10.0).all()
