@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from amrepair.arrays import Numbers, Points
+from amrepair.field import groups_kernels as kernels
 from amrepair.field.options import USUAL_SURFELS
 from amrepair.frames import cells_of
+from gcode.compiled import read_only
 
 # Pieces nearer than this are one defect, and so are cells of a field that touch at a corner.
 GROUP_MM, CELLS_APART = 1.2, 1.8
@@ -41,8 +41,7 @@ def cell_numbers(index: Int[np.ndarray, "n k"]) -> Numbers:
 
 def connected(one: Int[np.ndarray, " p"], other: Int[np.ndarray, " p"], count: int) -> Numbers:
     """(count,) a number for each of some things, the same for those that pairs of them link."""
-    graph = coo_array((np.ones(len(one), bool), (one, other)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1])
+    return kernels.groups(read_only(one, np.int64), read_only(other, np.int64), count)
 
 
 def touching_mm(cell_mm: float) -> float:
