@@ -6,6 +6,7 @@ A column is out of reach at a height where any slice of the envelope, placed the
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,10 @@ from gcode.surfaces import HeightField
 # So deep the flat may press into the plastic beside it, and the body lie in the noise of the field;
 # with what a scan gets wrong it stays under the checker's limits, 0.2 and 0.1 mm.
 PRESS_MM = 0.06
-# A wall may stand this much nearer than its cells say.
+# A wall may stand this much nearer than its cells say. Beside a cone half a cell is half a cell of
+# depth and no wall: there it only keeps a rim that just touches a cell from being taken to miss it.
 SIDE_MM = 0.03
+CONE_SIDE_MM = 0.01
 LEAST_TOLD_MM = 0.1
 
 
@@ -35,20 +38,19 @@ def least_tip(
 ) -> Float[np.ndarray, "ny nx"]:
     """How high the tip must at least be for a slice to clear all, wherever in its cell it is.
 
-    By column of the window, each cut into `finer` × `finer`.
-
-    A cone is asked about at the middles of the field's own cells: half a cell aside it is half a
-    cell higher, not a wall.
+    By column of the window, each cut into `finer` × `finer`. A cone is asked about at their
+    middles: a little aside it is as little higher, not a wall.
     """
     if part.widening_mm > 0:
-        under_mm = field.max_within(
+        near, inside = _cut(field, window, part.reach_mm, finer)
+        under_mm = near.max_within(
             part.polygon_mm,
-            window,
-            aside_mm=SIDE_MM,
+            inside,
+            aside_mm=CONE_SIDE_MM,
             widening_mm=part.widening_mm,
             height_mm=part.height_mm,
         )
-        return (under_mm - part.z_from_mm - PRESS_MM).repeat(finer, axis=0).repeat(finer, axis=1)
+        return under_mm - part.z_from_mm - PRESS_MM
     rows, columns = (finer * (w.stop - w.start) for w in window)
     least = np.empty((rows, columns))
     cell_mm = field.cell_mm / finer
@@ -59,6 +61,29 @@ def least_tip(
             under_mm = field.max_within(moved, window, aside_mm=0.5 * cell_mm + SIDE_MM)
             least[iy::finer, ix::finer] = under_mm - part.z_from_mm - PRESS_MM
     return least
+
+
+def _cut(
+    field: HeightField, window: tuple[slice, slice], around_mm: float, finer: int
+) -> tuple[HeightField, tuple[slice, slice]]:
+    """A window of the field and so much around it, each cell cut into `finer` × `finer`.
+
+    And the window in it. A cone's rim, which is 0.6 mm wide, is rounded to cells on the way: by a
+    tenth of a millimetre of depth in the field's own.
+    """
+    more = math.ceil(around_mm / field.cell_mm) + 3
+    first = [max(w.start - more, 0) for w in window]
+    rows, columns = (slice(a, w.stop + more) for a, w in zip(first, window, strict=True))
+    z_mm, seen = (
+        v[rows, columns].repeat(finer, axis=0).repeat(finer, axis=1)
+        for v in (field.z_mm, field.seen)
+    )
+    origin_mm = field.origin_mm + np.array(first[::-1]) * field.cell_mm
+    y, x = (
+        slice(finer * (w.start - a), finer * (w.stop - a))
+        for a, w in zip(first, window, strict=True)
+    )
+    return HeightField(origin_mm, field.cell_mm / finer, z_mm, seen), (y, x)
 
 
 class Reach:

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gcode.check.sweep import deepest_along
 from gcode.profiles import load_setup
 from gcode.slicing import reach_kernels
-from gcode.slicing.reach import Reach
+from gcode.slicing.reach import PRESS_MM, Reach
 from gcode.surfaces import HeightField
 
 
@@ -76,3 +77,45 @@ def test_the_cone_keeps_off_a_wall_that_its_flat_passes() -> None:
         nearest_mm = 6.0 - 0.05 * (np.flatnonzero(free).max() + 1)
         assert nearest_mm == pytest.approx(beside_mm, abs=0.2)
         assert not free[round((6.0 - beside_mm + 0.2) / 0.05) :].any()
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 8.0, 17.0, 33.0, 45.0])
+def test_beside_a_wall_the_cone_goes_as_deep_as_meant_and_a_cell_deeper_at_most(
+    turned_deg: float,
+) -> None:
+    # regression: on the cells of the field it was from 0.05 mm too high to 0.15 too deep
+    across = np.array([np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))])
+    middle = np.array([4.5, 4.5])
+    printer, cell_mm, tip_mm = load_setup(printer="prusa_mk3s").printer, 0.1, 0.05
+    x_mm, y_mm = np.meshgrid(*((np.arange(90) + 0.5) * cell_mm,) * 2)
+    for wall_mm in (0.0, 0.02, 0.049, 0.08):
+        behind = (np.stack([x_mm, y_mm], axis=-1) - middle) @ across >= wall_mm
+        z_mm = np.where(behind, 3.0, 0.0)
+        field = HeightField(np.zeros(2), cell_mm, z_mm, np.ones(z_mm.shape, dtype=bool))
+        reach = Reach(field, printer, window_mm=(3.0, 3.0, 6.0, 6.0), finer=round(cell_mm / tip_mm))
+        tips_mm = reach.centres_mm().reshape(*reach.shape, 2)
+        # of the place in a cell of the tip that is nearest to the wall; the profile's cone rises
+        # at 45 degrees, from 0.6 mm aside and 0.1 mm over the tip
+        apart_mm = wall_mm - (tips_mm - middle) @ across - 0.5 * tip_mm * np.abs(across).sum()
+        deep_mm = 3.0 - reach.need_mm - (apart_mm - 0.5)
+        along = deep_mm[(apart_mm > 0.65) & (apart_mm < 2.4)]
+        assert along.min() > 0.0
+        assert along.max() < PRESS_MM + cell_mm
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_tip_may_go_nowhere_that_the_checker_refuses(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    printer, cell_mm, finer = load_setup(printer="prusa_mk3s").printer, 0.1, 2
+    x_mm, y_mm = np.meshgrid(*((np.arange(80) + 0.5) * cell_mm - 4.0,) * 2)
+    turn = rng.uniform(0.0, np.pi)
+    u = x_mm * np.cos(turn) + y_mm * np.sin(turn)
+    v = y_mm * np.cos(turn) - x_mm * np.sin(turn)
+    long_mm, wide_mm = rng.uniform(0.8, 3.0, 2)
+    open_ = np.hypot(u, v) < long_mm if rng.random() < 0.5 else np.abs([u, v]).max(0) < wide_mm
+    z_mm = np.where(open_, 0.0, rng.uniform(0.5, 3.0)) + rng.normal(0.0, 0.03, x_mm.shape)
+    field = HeightField(np.full(2, -4.0), cell_mm, z_mm, np.ones(z_mm.shape, dtype=bool))
+    reach = Reach(field, printer, window_mm=(-2.0, -2.0, 2.0, 2.0), finer=finer)
+    places_mm = np.column_stack([reach.centres_mm(), reach.need_mm.ravel()])
+    assert deepest_along(places_mm, printer, field).max() <= 0.0
