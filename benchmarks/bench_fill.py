@@ -11,7 +11,7 @@ packages, says what its own head reaches and what the text's beads fill.
 Walls of the blocks lie along the columns of that field, and end with them. `--off-grid` turns and
 moves each case to five places where they do not: turned, narrow slots are filled less, and the cone
 keeps farther off. The judge knows tip and walls by columns of its own, and contact to half of one
-each: what it tells as 0.06 mm on the grid, and 0.16 beside it, is 0.125 in both. So contact of the
+each: what it tells as 0.06 mm on the grid, and 0.10 beside it, is 0.075 in both. So contact of the
 cone is told also where it truly is. Depth is measured upright: beside a wall that its hexagon
 overlaps by 0.02 mm it is all the wall.
 """

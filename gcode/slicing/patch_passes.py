@@ -13,7 +13,7 @@ from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job_lines import runs_of
 from gcode.slicing.layer_plan import Unprintable
 from gcode.slicing.patch_beads import Chain, begun_inside, beside_runs, draw, weighed
-from gcode.slicing.patch_bridges import Holds
+from gcode.slicing.patch_bridges import Bridges, Holds
 from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
 from gcode.slicing.patch_free import eased, free_between, free_runs
 from gcode.slicing.patch_heights import Height
@@ -63,17 +63,37 @@ def plan_pass(
     if not due.thick_mm.any():
         return None, state
     if planned is None:
-        laying = _along_own(model, state, at, due, setup)
-        if laying is not None:
-            beside_mm = model.options.bridges.pressed_mm
-            laying = _held(laying, Holds(model, state, at, beside_mm), model)
+        laying = _along_own_held(model, state, at, due, setup)
     else:
         laying, due = _along_either(model, state, at, planned, due, setup)
+        if laying is None or not laying.chains:
+            due, planned = _fallen(model, state, at, due), None
+            laying = _along_own_held(model, state, at, due, setup)
     if laying is None or not laying.chains:
         return None, state
     chains = tuple(_told_cold(chain, model, state, at) for chain in laying.chains)
     one = Pass(at.z_mm, laying.height_mm, at.index, chains, at.reach, at.z_mm)
     return one, _after(state, at, due, laying, planned)
+
+
+def _fallen(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
+    """Of what the job laid at a height, what may fall onto the floor where no line finds a hold.
+
+    Where the head first gets into a hollow at one of the job's own heights, all above hangs on it.
+    """
+    own = due_at(model, state, at)
+    falls = (due.thick_mm > 0) & own.loose
+    return replace(own, thick_mm=np.where(falls, own.thick_mm, 0.0), bridges=Bridges.none(model))
+
+
+def _along_own_held(
+    model: PatchModel, state: PatchState, at: Height, due: Due, setup: PrintSetup
+) -> _Laying | None:
+    laying = _along_own(model, state, at, due, setup)
+    if laying is None:
+        return None
+    beside_mm = model.options.bridges.pressed_mm
+    return _held(laying, Holds(model, state, at, beside_mm), model)
 
 
 def _told_cold(chain: Chain, model: PatchModel, state: PatchState, at: Height) -> Chain:

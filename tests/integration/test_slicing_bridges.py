@@ -301,3 +301,20 @@ def test_the_checker_knows_a_bridge_by_itself() -> None:
     assert said(Program("\n".join(lines) + "\n", program.dialect)) == {
         "strand over air that ends on nothing"
     }
+
+
+def test_along_a_jobs_lines_a_slot_is_begun_where_the_head_first_gets_in() -> None:
+    # regression: where that is one of the job's own heights no line found a hold there, nor any
+    # above it: declared 0.03 of a slot of which the head reaches 0.22
+    block = m3.Manifold.cube((14.0, 24.0, 6.0)).translate((60.0, 60.0, 0.0))
+    slot = m3.Manifold.cube((2.5, 16.0, 3.0)).translate((65.0, 64.0, 3.0))
+    job = job_for(write(plan_part(block, SETUP).toolpath, SETUP, title="job"), SETUP.printer)
+    lines = lines_of_job(job, job.beads.layer >= 0, SETUP)
+    field = HeightField.from_manifold(block - slot, 0.1, margin_mm=8.0)
+    grid = LayerGrid.from_setup(SETUP)
+    plan = slice_patch(
+        slot, SETUP, as_built=field, grid=grid, standalone=False, start_mm=PARK, lines=lines
+    )
+    program = write(plan.toolpath, SETUP, title="slot", resume=HOT, restore=False)
+    assert plan.reachable_mm3 > 0.18 * slot.volume()
+    assert not find_refusals(program, SETUP, as_built=field, initial=HOT, patch=lines.bridges)
