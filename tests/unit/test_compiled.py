@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import gc
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ import numba
 import numpy as np
 import pytest
 from numba.core.caching import IndexDataCacheFile
+from numba.core.errors import TypingError
+from numba.extending import overload
 
 from amrepair.template import signs_kernels
 from gcode import compiled
@@ -264,3 +268,30 @@ def test_a_turn_that_nobody_gives_back_is_waited_for_no_longer(tmp_path: Path) -
     assert late.take(wait_s=0.05)
     late.give()
     assert not compiled._Turn(Path("/dev/null/kernel.lock")).take()
+
+
+@pytest.mark.parametrize("was_on", [True, False])
+@pytest.mark.parametrize("fails", [True, False])
+def test_the_collector_rests_while_a_kernel_is_compiled_and_is_as_it_was_afterwards(
+    was_on: bool, fails: bool
+) -> None:
+    seen: list[bool] = []
+
+    def asked() -> int:
+        return 1
+
+    @overload(asked)
+    def told() -> Any:  # numba asks for it while it finds out the kernel's types
+        seen.append(gc.isenabled())
+        return None if fails else lambda: 1
+
+    kernel = numba.njit(lambda: asked())  # noqa: PLW0108 - the kernel has to call it
+    (gc.enable if was_on else gc.disable)()
+    try:
+        with pytest.raises(TypingError) if fails else nullcontext():
+            kernel.compile(())
+        assert gc.isenabled() is was_on
+    finally:
+        gc.enable()
+    assert seen
+    assert not any(seen)
