@@ -32,9 +32,8 @@ from gcode.surfaces.lines import columns_around, heights_by_lines
 
 # Around what the job lays beside the part: strands spread, and stringy ones stray.
 STRINGS_MM, BESIDE_CELL_MM = 0.4, 0.25
-LEFT_OPEN_LAYERS = (
-    2.0  # lower than the drawing by more, a place is open: slopes and rounding make one
-)
+# Lower than the drawing by more, a place is open: slopes and rounding make one.
+LEFT_OPEN_LAYERS = 2.0
 RIMS = ("perimeter", "wall")  # what slicers call it
 
 
