@@ -83,6 +83,7 @@ def ball(radius_mm: float) -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=5, radius=radius_mm)
 
 
+@pytest.mark.slow
 def test_repair_is_measured_to_the_surface_beside_the_sampling_floor() -> None:
     data = ClassInput("ball", Format.SHAPENET, (np.zeros((1, 3)),), ball(15.0), 0.1, 1.0)
     rng = np.random.default_rng(0)
@@ -97,6 +98,7 @@ def test_repair_is_measured_to_the_surface_beside_the_sampling_floor() -> None:
     assert larger.from_surface == pytest.approx(0.01, abs=3e-4)
 
 
+@pytest.mark.slow
 def test_pam_brings_a_cloud_onto_its_class() -> None:
     part = trimesh.load(KNOB, force="mesh")
     part.apply_scale(100.0 / float(np.linalg.norm(part.extents)))

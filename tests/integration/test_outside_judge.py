@@ -74,7 +74,10 @@ def _scan(solid: Solid, seed: int) -> Scan:
     return Scan(np.asarray(points) + noise, NOISE_MM, "build")
 
 
-@pytest.mark.parametrize("name", TOOLS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in ("boss", "worn edge") else n for n in TOOLS],
+)
 def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
     tool, least_filled = TOOLS[name]
     # from above: whatever stood over the piece is gone with it

@@ -123,7 +123,7 @@ def judge(made: Resumption, job: Program, setup: PrintSetup) -> Ran:
     [
         ("plant-sign", "generic_marlin", 9),
         ("prusaslicer-cube", "prusa_mk3s", 37),
-        ("prusaslicer-cube", "generic_reprap", 60),
+        pytest.param("prusaslicer-cube", "generic_reprap", 60, marks=pytest.mark.slow),
         pytest.param("screw", "generic_marlin", 110, marks=pytest.mark.slow),
         ("vase", "ender_3", 300),
         ("cura_slicer", "voron_2_4", 12),

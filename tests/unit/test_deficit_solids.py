@@ -69,7 +69,7 @@ def deficit_of(scan: Scan, template: AnalyticTemplate, **options: float) -> Defi
     return compute_deficit(scan, template, anomaly, build_from_template=IN_PLACE)
 
 
-@pytest.mark.parametrize("with_normals", [False, True])
+@pytest.mark.parametrize("with_normals", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", sorted(CUTS))
 def test_a_cut_in_a_whole_part_cloud(name: str, with_normals: bool) -> None:
     built = BLOCK.body - CUTS[name]
