@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -265,10 +265,9 @@ class _Service:
             self._held = self._machine.rests_at()
             if self._held is None:
                 return
-            state = state_at_rest(begun.job, self._held)
-            if isinstance(self._machine, PullsAtRest):
-                pulled_mm = state.pulled_mm + self._machine.pulled_at_rest_mm()
-                state = replace(state, pulled_mm=pulled_mm)
+            on = self._machine
+            paused_mm = on.pulled_at_rest_mm() if isinstance(on, PullsAtRest) else 0.0
+            state = state_at_rest(begun.job, self._held, paused_mm=paused_mm)
             _, parked = park(begun.setup, state)
             self._machine.leave(way_back(begun.setup, state, parked))
         except LinkError:

@@ -148,8 +148,8 @@ class Run:
         now = self._course.stop(stop)
         if now is None:
             return True  # nothing is printed there any more
-        state, began = state_at_rest(self._job, now.line), self._checked
-        state = replace(state, pulled_mm=state.pulled_mm + self._wire.pulled_at_rest_mm())
+        pulled_mm, began = self._wire.pulled_at_rest_mm(), self._checked
+        state = state_at_rest(self._job, now.line, paused_mm=pulled_mm)
         site = self._expected(stop, now)
         with self._watch("print"):
             program, parked = travel.park(site.setup, state)
@@ -244,7 +244,7 @@ class Run:
         if self._tape.live:
             raise TapeEndsError("the record ends here")
         site = self._site_at(stop)
-        _, parked = travel.park(site.setup, state_at_rest(self._job, stop.line))
+        _, parked = travel.park(site.setup, self._job.state_after(stop.line))
         while self._tape.next_stop() == stop.label:
             self._try_to_look(stop, site, parked)
         return True

@@ -37,7 +37,6 @@ from gcode.moves import ModalState
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job
-from gcode.resumption.head import state_at_rest
 from gcode.resumption.standing import standing_field
 from gcode.resumption.touch_tour import cooled, heated, tour
 from gcode.surfaces import HeightField
@@ -222,7 +221,7 @@ class ProbeScanner:
     def _touched(self, stop: Stop, flats: Flats, standing: HeightField) -> tuple[Touches, int]:
         """All touches of a look, and how many they were."""
         most = self._options.most
-        _, rest = travel.park(self._setup, state_at_rest(self._job, stop.line))
+        _, rest = travel.park(self._setup, self._job.state_after(stop.line))
         self._progress(f"touch {stop.label}: the nozzle gets ready", 0.0, float(most))
         self._feeler.get_ready(rest)
         felt_mm = np.zeros((0, 3))

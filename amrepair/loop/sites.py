@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from scipy import ndimage
 
 from amrepair.arrays import Mask
@@ -24,7 +25,7 @@ from amrepair.template import KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import JobBridges
 from gcode.profiles import PrintSetup
-from gcode.reader import Job
+from gcode.reader import Beads, Job
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.surfaces import HeightField
@@ -167,12 +168,8 @@ def _left_open(job: Job, template: Template, build_from_template: Transform) -> 
         solid.transform(build_from_template.matrix[:3]), BESIDE_CELL_MM, margin_mm=STRINGS_MM
     )
     pick = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
-    start, end = beads.start_mm[pick], beads.end_mm[pick]
-    half_mm = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6)
-    laid_mm = heights_by_lines(
-        start, end, half_mm, np.maximum(start[:, 2], end[:, 2]),
-        low_mm=part.origin_mm, cell_mm=BESIDE_CELL_MM, shape=part.z_mm.shape,
-    )  # fmt: skip
+    half_mm = _half_widths_mm(beads, pick)
+    laid_mm = _heights_mm(beads, pick, half_mm, part.origin_mm, part.z_mm.shape)
     least_mm = LEFT_OPEN_LAYERS * np.median(beads.height_mm[pick])
     lower = (part.z_mm > 0.0) & (part.z_mm - laid_mm > least_mm)
     room_mm = (ndimage.distance_transform_edt(lower) - 0.5) * BESIDE_CELL_MM
@@ -202,14 +199,29 @@ def _beside(job: Job, which: Mask) -> HeightField | None:
 def _as_high_as(job: Job, pick: Mask, wider_mm: float) -> HeightField:
     """How high some of a job's beads stand, build frame; −inf farther than that beside them."""
     beads = job.beads
-    start, end = beads.start_mm[pick], beads.end_mm[pick]
-    within = 0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6) + wider_mm
-    low, shape = columns_around(start, end, float(within.max()), BESIDE_CELL_MM)
-    z_mm = heights_by_lines(
-        start, end, within, np.maximum(start[:, 2], end[:, 2]),
-        low_mm=low, cell_mm=BESIDE_CELL_MM, shape=shape,
-    )  # fmt: skip
+    within_mm = _half_widths_mm(beads, pick) + wider_mm
+    low, shape = columns_around(
+        beads.start_mm[pick], beads.end_mm[pick], float(within_mm.max()), BESIDE_CELL_MM
+    )
+    z_mm = _heights_mm(beads, pick, within_mm, low, shape)
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
+
+
+def _half_widths_mm(beads: Beads, pick: Mask) -> Float[np.ndarray, " k"]:
+    """(k,) of some beads, as if they were as wide at the top as at the bottom."""
+    return np.asarray(0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6))
+
+
+def _heights_mm(
+    beads: Beads, pick: Mask, within_mm: Float[np.ndarray, " k"], low_mm: Float[np.ndarray, " 2"],
+    shape: tuple[int, int],
+) -> Float[np.ndarray, "ny nx"]:  # fmt: skip
+    """How high some beads stand over columns so near to them; −inf over the others."""
+    start, end = beads.start_mm[pick], beads.end_mm[pick]
+    return heights_by_lines(
+        start, end, within_mm, np.maximum(start[:, 2], end[:, 2]),
+        low_mm=low_mm, cell_mm=BESIDE_CELL_MM, shape=shape,
+    )  # fmt: skip
 
 
 def lines_of_job(job: Job, which: Mask, setup: PrintSetup) -> JobLines:

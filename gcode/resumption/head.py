@@ -73,9 +73,12 @@ def pulled_back_mm(job: Job, line: int) -> float:
     return float(filament_back_mm(job)[line])
 
 
-def state_at_rest(job: Job, line: int) -> ModalState:
-    """The machine's state after lines [0, line) of a job, with what filament is pulled back."""
-    return replace(job.state_after(line), pulled_mm=pulled_back_mm(job, line))
+def state_at_rest(job: Job, line: int, *, paused_mm: float = 0.0) -> ModalState:
+    """The machine's state after lines [0, line) of a job, with what filament is pulled back.
+
+    By the job, and `paused_mm` more by the pause in which it rests.
+    """
+    return replace(job.state_after(line), pulled_mm=pulled_back_mm(job, line) + paused_mm)
 
 
 class Head:
