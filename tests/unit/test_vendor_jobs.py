@@ -283,6 +283,39 @@ def test_heads_that_do_not_print_are_watched_too(start: str, end: str, said: str
     assert any(said in one for one in refused(text))
 
 
+FILAMENTS = {
+    "filament_type": "PLA;PETG;TPU",
+    "filament_settings_id": '"My PLA";"My PETG";"My TPU"',
+    "temperature": "205,240,225",
+    "bed_temperature": "60,85,50",
+    "filament_max_volumetric_speed": "15,8,3",
+    "nozzle_diameter": "0.4,0.4,0.4",
+    "retract_length": "0.8,1.4,2",
+    "single_extruder_multi_material": "1",
+}
+
+
+@pytest.mark.parametrize(
+    ("taken", "name", "hotend_c", "bed_c", "melted_mm3_s", "retraction_mm"),
+    [
+        ("T0", "My PLA", 205.0, 60.0, 15.0, 0.8),
+        ("T1", "My PETG", 240.0, 85.0, 8.0, 1.4),
+        ("T0\nG1 X20 E1\nT2", "My TPU", 225.0, 50.0, 3.0, 2.0),
+    ],
+)
+def test_a_job_s_own_material_is_that_of_the_filament_that_it_prints(
+    taken: str, name: str, hotend_c: float, bed_c: float, melted_mm3_s: float, retraction_mm: float
+) -> None:
+    """regression: of several filaments the first was taken, whichever the job prints."""
+    own = own_settings(job(f"{START}\n{taken}", **FILAMENTS), "job.gcode")
+    assert own is not None
+    setup = own.setup()
+    assert (own.found.profiles[1].name, setup.printer.tool) == (name, int(taken[-1]))
+    told = (setup.material.hotend_c, setup.material.bed_c, setup.material.max_volumetric_mm3_s)
+    assert told == (hotend_c, bed_c, melted_mm3_s)
+    assert setup.printer.retraction_mm == retraction_mm
+
+
 @pytest.mark.parametrize("tool", ["T0", "T1"])
 def test_a_job_goes_on_with_the_head_that_printed(tool: str) -> None:
     """regression: T0 was not taken, which lies in its dock after a power loss; others were heated

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,13 @@ from pydantic import ValidationError
 from gcode.errors import InputError, ProfileError
 from gcode.profiles.importers.jobs import JOB_SUFFIXES, read_settings
 from gcode.profiles.importers.klipper import KLIPPER_RULES, bed_note, finish, read_klipper
-from gcode.profiles.importers.macros import ends_homing, head_used, heads_of, macros_named
+from gcode.profiles.importers.macros import (
+    ends_homing,
+    head_used,
+    heads_of,
+    macros_named,
+    of_head,
+)
 from gcode.profiles.importers.rules import Imported, LeftOut, Rule, Source, apply
 from gcode.profiles.importers.slicers import ORCA, PRUSA, read_orca, read_prusa
 from gcode.profiles.machines import machine_named
@@ -159,15 +165,20 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     if settings is None:
         return None
     rules, source = settings
+    head = head_used(text)
+    of_filament = {key for key, rule in rules.items() if rule.kind == "materials"}
+    of_filament |= {key for key, kind in source.name_keys.items() if kind == "materials"}
+    values = of_head(source.values, head, of_filament | {"filament_type"})
+    every, source = source, replace(source, values=values)
     parents = {kind: _parent(kind, source, rules) for kind in source.kinds}
     parents["printers"] = inherits or parents["printers"]
     made, left = apply(source, rules, parents)
     notes, more = [], list(left)
     for profile in made:
         notes += _settle(profile)
-        _add_named(profile, source)
+        _add_named(profile, every)
         if profile.values.get("heads", 1) > 1:
-            profile.values["tool"] = min(head_used(text), profile.values["heads"] - 1)
+            profile.values["tool"] = min(head, profile.values["heads"] - 1)
         more += _within_range(profile)
     _as_able_as_told(*made[:2])
     return ImportedFile(name, made, tuple(more), tuple(notes))

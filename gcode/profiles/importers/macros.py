@@ -8,7 +8,8 @@ not make known what the checker has left out.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
 
 # PrusaSlicer's and OrcaSlicer's keys of scripts.
 _SCRIPT_KEY = re.compile(r"^(?!post_process)\w*gcode\w*$")
@@ -47,6 +48,7 @@ KLIPPERS_OWN = re.compile(
 _TAKEN = re.compile(r"^[ \t]*T(\d+)\b", re.MULTILINE)
 _HEATED = re.compile(r"^[ \t]*M10[49] .*?\bT[1-9]", re.MULTILINE)
 _CHOSEN = re.compile(r"^[ \t]*(?:T|M10[49] .*?\bT)(\d+)\b", re.MULTILINE)
+_OF_A_NOZZLE = re.compile(r"nozzle_diameter|(?:de)?retract(?:ion)?_\w+")
 MOST_HEADS = 64  # beyond are Bambu Lab's signs, T255 and T1000
 
 
@@ -71,8 +73,41 @@ def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
 
 
 def head_used(text: str) -> int:
-    """The head that a job, which uses one, takes last."""
-    return next((int(tool) for tool in reversed(_TAKEN.findall(text)) if int(tool) < MOST_HEADS), 0)
+    """The head, or the filament, that the most of a job's text is printed with."""
+    printed = text[: text.rfind("\nG1 ") + 1]
+    taken = [
+        (int(found[1]), found.end())
+        for found in _TAKEN.finditer(printed)
+        if int(found[1]) < MOST_HEADS
+    ]
+    ends = [at for _, at in taken[1:]] + [len(printed)] * bool(taken)
+    share: Counter[int] = Counter()
+    for (tool, at), end in zip(taken, ends, strict=True):
+        share[tool] += end - at
+    return max(share, key=share.__getitem__, default=0)
+
+
+def of_head(
+    values: Mapping[str, str], head: int, filament_keys: Collection[str]
+) -> dict[str, str]:
+    """A job's settings with those of one head, or filament, where a value is told for each.
+
+    Parameters
+    ----------
+    filament_keys
+        Keys that tell a value for each filament; what tells one for each nozzle is known.
+    """
+    filaments = len(values.get("filament_type", "").split(";"))
+    nozzles = len(values.get("nozzle_diameter", "").split(","))
+    made = dict(values)
+    for key, text in values.items():
+        count = nozzles if _OF_A_NOZZLE.fullmatch(key) else filaments
+        if count < 2 or not (_OF_A_NOZZLE.fullmatch(key) or key in filament_keys):
+            continue
+        several = text.split(";" if ";" in text else ",")
+        if len(several) == count and head < count:
+            made[key] = several[head].strip()
+    return made
 
 
 def ends_homing(settings: Mapping[str, str]) -> bool:
