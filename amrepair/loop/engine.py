@@ -438,7 +438,8 @@ class Run:
                 return replace(look, declined=True)
             fills = [v for v in look.decision.verdicts if v.action is Action.FILL_NOW]
             situation = look.decision.situation
-            if fills and not (situation.refused or situation.last_pass or situation.stuck):
+            barred = situation.refused or situation.other_material
+            if fills and not (barred or situation.last_pass or situation.stuck):
                 return replace(look, printed=self._approval.approve(look.plan))
         return look
 

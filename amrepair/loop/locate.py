@@ -5,8 +5,9 @@ It reads the job, not the bed: nothing is measured here.
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -35,16 +36,22 @@ OUTER_WALLS = frozenset(
         "perimeter path",
     }
 )  # fmt: skip
-# What lies beside a part, and is none of it; the same slicers' names.
-BESIDE_THE_PART = frozenset(
+# What takes the plastic that a change of filament pushes out, and what else lies beside a part and
+# is none of it; the same slicers' names.
+TOWERS = frozenset({"wipe tower", "prime tower", "prime-tower", "prime pillar", "pillar path"})
+BESIDE_THE_PART = TOWERS | frozenset(
     {
         "skirt", "brim", "skirt/brim", "support material", "support material interface", "support",
-        "support interface", "support transition", "support-interface", "wipe tower",
-        "prime tower", "prime-tower", "custom", "prime pillar", "skirt path", "support path",
-        "brim path", "pillar path",
+        "support interface", "support transition", "support-interface", "custom", "skirt path",
+        "support path", "brim path",
     }
 )  # fmt: skip
 THING_STEP_MM, THING_CELL_MM = 0.8, 0.2
+# By more, a job lays its walls elsewhere than its part has them: 30 that do not, by 0.03 at most.
+MOVED_MM, MOST_MOVES = 0.04, 5
+# Of its height, a bead is wider by so much than a rectangle: half of what round sides make, since
+# some slicers reckon with those and some without.
+ROUND_SIDES = 0.5 * (1.0 - math.pi / 4.0)
 OFF_LAYERS = 1.5  # walls tell the height to about a layer; a raft has two and more
 UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
@@ -126,10 +133,7 @@ def locate_parts(
     ours = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
     outer = ours & of_roles(beads, OUTER_WALLS)
     pick = outer if outer.any() else ours
-    # half of what a bead stands for: its own rounded width is a little more
-    half_mm = float(
-        np.median(0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6))
-    )
+    half_mm = float(np.median(_half_beads_mm(beads, pick)))
     inset = _Inset(template, half_mm)
     thing = _things(beads.start_mm[ours, :2], beads.end_mm[ours, :2], half_mm)
     if not outer.any():
@@ -222,8 +226,9 @@ def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform |
         beside[:2, 3] += away[:2]
         with suppress(AlignmentError):
             guess = Transform("build", "template", beside).inverse()
-            placed = align(walls, inset, guess=guess).template_from_scan.inverse()
-            if _off_mm(walls, inset, placed) < 0.5 * layer_height_mm:
+            there = align(walls, inset, guess=guess).template_from_scan.inverse()
+            placed, _, off_mm = _as_moved(walls, inset, there)
+            if off_mm < 0.5 * layer_height_mm:
                 return placed
     try:
         found = align(walls, inset)
@@ -234,18 +239,61 @@ def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform |
         ) from error
     alike = (found.template_from_scan, *found.symmetric_alternatives)
     placed = max((pose.inverse() for pose in alike), key=lambda pose: float(np.trace(pose.matrix)))
-    off_mm = _off_mm(walls, inset, placed)
-    if off_mm > 0.5 * layer_height_mm:
+    placed, outside_mm, off_mm = _as_moved(walls, inset, placed)
+    if off_mm > 0.5 * layer_height_mm or abs(outside_mm) > inset.depth_mm:
         raise AlignmentError(
-            f"the job's walls lie {off_mm:.3f} mm off the template, the limit is half a layer "
+            f"the job's walls lie {outside_mm:+.3f} mm outside the template's and {off_mm:.3f} mm "
+            f"off that, the limits are half a bead ({inset.depth_mm:.2g} mm) and half a layer "
             f"({0.5 * layer_height_mm:g} mm); is it this part, at this scale?"
         )
     return placed
 
 
-def _off_mm(walls: Scan, inset: _Inset, placed: Transform) -> float:
-    """How far walls lie off the template's, the median."""
-    return float(np.median(np.abs(inset.distance(placed.inverse().apply(walls.points_mm)))))
+def _as_moved(walls: Scan, inset: _Inset, placed: Transform) -> tuple[Transform, float, float]:
+    """The pose with all walls moved alike, how far outside they lie, and how far each off that."""
+    outside_mm, off_mm = _off_mm(walls, inset, placed)
+    more_mm = outside_mm
+    for _ in range(MOST_MOVES):
+        if abs(more_mm) < MOVED_MM:
+            break
+        moved = replace(inset, depth_mm=inset.depth_mm - outside_mm)
+        placed = align(walls, moved, guess=placed.inverse()).template_from_scan.inverse()
+        more_mm, off_mm = _off_mm(walls, moved, placed)
+        outside_mm += more_mm
+    return placed, outside_mm, off_mm
+
+
+def _off_mm(walls: Scan, inset: _Inset, placed: Transform) -> tuple[float, float]:
+    """How far outside the template's all walls lie, and the median of how far each lies off that.
+
+    Slicers move all walls by what their user tells them ('XY compensation', 'horizontal
+    expansion'), so that holes and shafts of a printer that lays too much fit. Of walls all around
+    the mean is the same wherever the part is put.
+    """
+    outside_mm = inset.distance(placed.inverse().apply(walls.points_mm))
+    all_mm = float(np.clip(outside_mm, -inset.depth_mm, inset.depth_mm).mean())
+    return all_mm, float(np.median(np.abs(outside_mm - all_mm)))
+
+
+def walls_moved_mm(job: Job, template: Template, placed: Transform) -> float:
+    """How far outside the template's a job lays all outer walls, the median; 0 where none is known.
+
+    Below 0 it makes the part smaller, and its holes wider.
+    """
+    beads = job.beads
+    pick = (beads.layer >= 0) & of_roles(beads, OUTER_WALLS)
+    if not pick.any():
+        return 0.0
+    points, owner = places_along(beads.start_mm[pick], beads.end_mm[pick], THING_STEP_MM)
+    points[:, 2] -= 0.5 * beads.height_mm[pick][owner]
+    outside_mm = template.distance(placed.inverse().apply(points))
+    return float(np.median(outside_mm + _half_beads_mm(beads, pick)[owner]))
+
+
+def _half_beads_mm(beads: Beads, pick: Mask) -> Float[np.ndarray, " k"]:
+    """(k,) of some beads, as slicers reckon them."""
+    height_mm = np.maximum(beads.height_mm[pick], 1e-6)
+    return np.asarray(0.5 * (beads.section_mm2[pick] / height_mm + ROUND_SIDES * height_mm))
 
 
 def _nth(number: int) -> str:

@@ -13,7 +13,16 @@ from scipy import ndimage
 
 from amrepair.arrays import Mask
 from amrepair.frames import Transform
-from amrepair.loop.locate import BESIDE_THE_PART, first_layer, foot_mm, of_roles, tops_of
+from amrepair.loop.locate import (
+    BESIDE_THE_PART,
+    MOVED_MM,
+    TOWERS,
+    first_layer,
+    foot_mm,
+    of_roles,
+    tops_of,
+    walls_moved_mm,
+)
 from amrepair.loop.looks import Stop
 from amrepair.regions import detect
 from amrepair.regions.calibration import NORMAL_NOISE
@@ -48,7 +57,7 @@ class Expected:
     by_beads: bool
     detector: Detector
     _at: Callable[[Stop], Site]
-    _ends_open: Callable[[], bool]
+    _ends_otherwise: Callable[[], bool]
 
     def __call__(self, stop: Stop) -> Site:
         """At one stop."""
@@ -58,7 +67,7 @@ class Expected:
         """The same of another job: what is left of it, say."""
         return _expected(
             job, self.template, self.build_from_template, self.setup, self.by_beads, self.detector,
-            self._ends_open,
+            self._ends_otherwise,
         )  # fmt: skip
 
 
@@ -75,14 +84,18 @@ def sites(
 
     A finished part is judged by its template. A layer is, too, where `by_beads` is false (all of
     it is planned to be solid); else by the beads that the job planned, so that open infill is
-    none of the defects; so is a finished part that the job leaves open at its top, as a vase.
+    none of the defects; so is a finished part that the job leaves open at its top, as a vase, or
+    whose walls it moves ('XY compensation', 'horizontal expansion').
     """
 
     @functools.cache
-    def ends_open() -> bool:
-        return by_beads and _left_open(job, template, build_from_template)
+    def ends_otherwise() -> bool:
+        return by_beads and (
+            _left_open(job, template, build_from_template)
+            or abs(walls_moved_mm(job, template, build_from_template)) > MOVED_MM
+        )
 
-    return _expected(job, template, build_from_template, setup, by_beads, detector, ends_open)
+    return _expected(job, template, build_from_template, setup, by_beads, detector, ends_otherwise)
 
 
 def _expected(
@@ -92,16 +105,17 @@ def _expected(
     setup: PrintSetup,
     by_beads: bool,
     detector: Detector,
-    ends_open: Callable[[], bool],
+    ends_otherwise: Callable[[], bool],
 ) -> Expected:
     """As `sites`; what the whole job ends with is asked once, whatever is left of it later."""
     grid = LayerGrid.from_tops(tops_of(job), layer_height_mm=setup.process.layer_height_mm)
     template_from_build = build_from_template.inverse()
     kept = KeptFills()
     first, raft = first_layer(job), _raft(job, template, template_from_build)
+    towers = of_roles(job.beads, TOWERS)
 
     def at(stop: Stop) -> Site:
-        if stop.layer_index is None and not ends_open():
+        if stop.layer_index is None and not ends_otherwise():
             every = job.beads.layer >= 0
             return Site(
                 template,
@@ -117,11 +131,12 @@ def _expected(
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         beads = job.beads
         done = (beads.line < stop.line) & (beads.layer >= 0)
-        over_raft = done & (beads.layer >= first)
+        # a tower stands as it does: nothing of it is to be mended
+        judged = done & (beads.layer >= first) & ~towers
         start, end = (
-            template_from_build.apply(place[over_raft]) for place in (beads.start_mm, beads.end_mm)
+            template_from_build.apply(place[judged]) for place in (beads.start_mm, beads.end_mm)
         )
-        section, height = beads.section_mm2[over_raft], beads.height_mm[over_raft]
+        section, height = beads.section_mm2[judged], beads.height_mm[judged]
         planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
         recent = PlannedBeads.recent(start, end, section, height)
         below = template.below_z(z_mm)
@@ -136,12 +151,12 @@ def _expected(
             beads=recent,
             lines=lines_of_job(job, done, setup),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
-            beside=_beside(job, done & ~over_raft if by_beads else done),
+            beside=_beside(job, done & ~judged if by_beads else done),
             raft=raft,
             laid=_laid(job, done, kept),
         )
 
-    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_open)
+    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_otherwise)
 
 
 def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from amrepair.loop.buried import buried, buried_mm3, pieces_of, ways
+from amrepair.loop.filaments import other_material
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
@@ -65,6 +66,7 @@ def decide_look(
         little_left=_done(here, plan, policy),
         beyond="" if limits is None else _beyond(plan, limits),
         buried_mm3=buried_mm3(left),
+        other_material=other_material(plan, job, stop.line),
     )
     decision = decide(verdicts, situation, policy)
     if decision.action is not Action.OFFER:

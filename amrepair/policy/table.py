@@ -110,6 +110,8 @@ class Situation:
         A limit of the profile that the repair would exceed, where nobody is asked; else empty.
     buried_mm3
         What stays open under layers that were printed since, however the stop is left.
+    other_material
+        What is in the nozzle, where it is not the material of what is missing; else empty.
     """
 
     gravest: Action
@@ -120,6 +122,7 @@ class Situation:
     little_left: bool = False
     beyond: str = ""
     buried_mm3: float = 0.0
+    other_material: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,6 +192,7 @@ _QUANTITY_NAMES = {
     "gravest": "gravest",
     "beyond": "beyond a limit for printing unasked",
     "buried_mm3": "left open under later layers",
+    "other_material": "another material is in the nozzle",
 }
 _QUANTITY_UNITS = {
     "thickness_layers": " layers",
@@ -315,6 +319,8 @@ STOP_ROWS: tuple[Row, ...] = (
         "as many passes as are allowed have been made"),
     Row("S7", Action.GO_ON, (_FILL, _is("refused", True)),
         "the checker refuses the patch, or the nozzle reaches nothing of it"),
+    Row("S7a", Action.GO_ON, (_FILL, Condition("other_material", "stated", None)),
+        "the nozzle holds another material than what is missing is of; a later look may fill it"),
     Row("S8", Action.PAUSE, (_FILL, Condition("beyond", "stated", None)),
         "larger than the profile lets be printed unasked"),
     Row("S9", Action.FILL_NOW, (_FILL,),

@@ -342,6 +342,8 @@ def decision_of(look: Look) -> ReportDecision:
         reasons.append(_sentence(plan.refused))
     if decided.situation.beyond:
         reasons.append(_sentence(decided.situation.beyond))
+    if decided.situation.other_material:
+        reasons.append(_sentence(f"the nozzle holds {decided.situation.other_material}"))
     reasons += [_sentence(way.told) for way in decided.ways]
     if plan.unreachable_mm3 > NEGLIGIBLE_MM3:
         reasons.append(f"The nozzle cannot reach {quantity(plan.unreachable_mm3, 'mm³')}.")

@@ -100,6 +100,7 @@ class Motion:
         self._chamber_c = 0.0
         self._pulled_mm = 0.0 if state is None else state.pulled_mm
         self._short_mm3 = 0.0
+        self._loads = False  # another filament was taken, and nothing is printed of it yet
         self._line, self._text = 0, ""
         printer = setup.printer
         x0, y0, x1, y1 = printer.reach_box_mm
@@ -410,10 +411,18 @@ class Motion:
             self._pull(pushed_mm)
             return
         if self._pulled_mm > printer.max_extrude_only_mm:
-            told = (f"{self._pulled_mm:.1f} mm", f"{printer.max_extrude_only_mm:g} mm")
-            self._refuse("pulls filament back and prints on", *told)
-            self._pulled_mm = 0.0  # said once
+            if (
+                self._loads
+                and pushed_mm * self._area_mm2 > printer.max_bead_section_mm2 * length_mm
+            ):
+                self._fresh_mm3(pushed_mm)  # too much for a bead: it is on its way to the nozzle
+                return
+            if not self._loads:
+                told = (f"{self._pulled_mm:.1f} mm", f"{printer.max_extrude_only_mm:g} mm")
+                self._refuse("pulls filament back and prints on", *told)
+            self._pulled_mm = 0.0  # said once; or a bead, so what changed the filament loaded it
         fresh_mm3 = self._fresh_mm3(pushed_mm)
+        self._loads = self._loads and fresh_mm3 <= 0.0
         if not known:  # from an end stop, which may lie a whole line away
             return
         section_mm2 = fresh_mm3 / length_mm
@@ -465,8 +474,8 @@ class Motion:
 
     def _pull(self, pushed_mm: float) -> None:
         self._pulled_mm -= pushed_mm
-        limit_mm = self._setup.printer.max_extrude_only_mm
-        if self._pulled_mm > limit_mm:
+        printer, limit_mm = self._setup.printer, self._setup.printer.max_extrude_only_mm
+        if self._pulled_mm > limit_mm and not printer.one_nozzle:  # else it changes filaments
             told = ("pulls filament back", f"{self._pulled_mm:.1f} mm", f"{limit_mm:g} mm")
             # Unloading; that it prints on after that is refused.
             if self._beyond(*told, self._pulled_mm / limit_mm, math.inf):

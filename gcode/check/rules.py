@@ -279,20 +279,22 @@ class Judge(Motion):
             return None
 
     def _choose(self, tool: str) -> None:
-        """The only tool may have any number, but another one later would be another colour.
+        """Of several filaments to one nozzle each may be taken at any time, of heads one prints.
 
-        Of several heads one prints, and until it does another may be chosen.
+        The only tool may have any number. What changes the filament loads it behind our back, so
+        what was pulled back of the last one comes back as far as the next one is pushed here.
         """
-        several, pushed = self._setup.printer.heads > 1, self.moves.sums.pushed
-        before = self._tool or ("T0" if pushed or several else tool)
-        if tool != before and (pushed or not several):
+        printer, pushed = self._setup.printer, self.moves.sums.pushed
+        before = self._tool or ("T0" if pushed or printer.heads > 1 else tool)
+        if tool != before and not printer.one_nozzle and (pushed or printer.heads == 1):
             self._refuse("change of tool or filament", tool, f"{before}, as it began")
             self._tool = before
             return
-        if self._setup.printer.docks:
+        if printer.docks:
             self._parked_c[before] = (self._hotend_c, self._ready_c)
             self._hotend_c, self._ready_c = self._parked_c.pop(tool, (0.0, 0.0))
             self._place = [None] * 3  # where it is picked up
+        self._loads = tool != before or self._loads
         self._tool = tool
 
     # ------------------------------------------------------------------ commands

@@ -7,6 +7,7 @@ straight down, and says again what the job had set.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from gcode.dialects import dialect_of, fan_command, number
 from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile, PrintSetup
-from gcode.reader import Job
+from gcode.reader import Job, text_kernels
 from gcode.resumption.settings import Settings
 from gcode.slicing.room import bare_place, room_for_line
 from gcode.surfaces import HeightField
@@ -63,9 +64,18 @@ def height_over(top_mm: float, state: ModalState, printer: PrinterProfile) -> fl
 
 
 def filament_back_mm(job: Job) -> Float[np.ndarray, " m"]:
-    """(m + 1,) filament that is back in the nozzle before each line of a job, and at its end."""
+    """(m + 1,) filament that is back in the nozzle before each line of a job, and at its end.
+
+    Another filament is loaded as far as it has to be, by whatever changes it.
+    """
     pushed_mm = np.concatenate([[0.0], np.cumsum(job.moves()[1])])
-    return np.asarray(np.maximum.accumulate(pushed_mm) - pushed_mm)
+    tool = job.block.states[:, text_kernels.S_TOOL]
+    starts = [0, *(np.flatnonzero(np.diff(tool)) + 1), len(pushed_mm)]
+    back_mm = np.empty(len(pushed_mm))
+    for first, end in pairwise(starts):
+        of_one_mm = pushed_mm[first:end]
+        back_mm[first:end] = np.maximum.accumulate(of_one_mm) - of_one_mm
+    return back_mm
 
 
 def pulled_back_mm(job: Job, line: int) -> float:

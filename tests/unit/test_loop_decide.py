@@ -64,6 +64,7 @@ SITUATIONS = {
     "S5": Situation(Action.FILL_NOW, stuck=True),
     "S6": Situation(Action.FILL_NOW, last_pass=True),
     "S7": Situation(Action.FILL_NOW, refused=True),
+    "S7a": Situation(Action.FILL_NOW, other_material="PETG (T1), not PLA"),
     "S8": Situation(Action.FILL_NOW, beyond="too much"),
     "S9": Situation(Action.FILL_NOW),
     "S10": Situation(Action.FILL_WITH_NEXT),

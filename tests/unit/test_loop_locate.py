@@ -23,6 +23,7 @@ from amrepair.loop.locate import (
     locate_parts,
     stood,
     tops_of,
+    walls_moved_mm,
 )
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.sites import sites
@@ -328,3 +329,23 @@ def test_a_first_layer_over_a_gap_is_pressed_down_by_the_next() -> None:
     assert tops_mm[3] == pytest.approx(0.93)
     assert (np.diff(tops_mm) > 0.0).all()
     assert foot_mm(job) == pytest.approx(0.73)
+
+
+@pytest.mark.parametrize("moved_mm", [-0.15, -0.1, 0.0, 0.1, 0.15])
+def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
+    """regression: 'XY size compensation' of 0.1 mm made it another part, or one that lacks it."""
+    outline = m3.CrossSection([[(0.0, 0.0), (18.0, 0.0), (18.0, 5.0), (7.0, 12.0), (0.0, 12.0)]])
+    part = outline.extrude(5.0)
+    laid = outline.offset(moved_mm, m3.JoinType.Miter).extrude(5.0).translate((100.0, 90.0, 0.0))
+    job = job_of(laid)
+    template = MeshSdf.from_mesh(solid_mesh(part))
+    placed = locate_part(job, template, layer_height_mm=LAYER_MM)
+    assert off_mm_of(placed, (100.0, 90.0, 0.0), part) < 0.05
+    assert walls_moved_mm(job, template, placed) == pytest.approx(moved_mm, abs=0.02)
+    final = sites(job, template, placed, SETUP)(plan_stops(job, [])[-1])
+    assert (final.planned is not None) == (moved_mm != 0.0)
+
+
+def off_mm_of(placed: Transform, at_mm: tuple[float, ...], part: m3.Manifold) -> float:
+    corners = np.asarray(solid_mesh(part).vertices)
+    return float(np.linalg.norm(placed.apply(corners) - corners - at_mm, axis=1).max())

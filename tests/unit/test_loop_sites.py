@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import manifold3d as m3
 import numpy as np
 from loop_bench import solid_mesh
@@ -61,3 +63,22 @@ def test_a_part_that_is_closed_is_held_against_its_template() -> None:
     stop = plan_stops(job, [])[-1]
     assert sites(job, template, here, SETUP)(stop).planned is None
     assert sites(job_of(BLOCK - HOLLOW), template, here, SETUP)(stop).planned is not None
+
+
+def test_a_tower_is_nothing_to_be_mended() -> None:
+    """regression: what a change of filament pushes out was planned to be repaired there."""
+    job = job_of(BLOCK)
+    tower = np.flatnonzero(job.beads.layer >= 0)[::7]
+    roles = (*job.beads.roles, "Wipe tower")
+    role = job.beads.role.copy()
+    role[tower] = len(roles) - 1
+    start, end = job.beads.start_mm.copy(), job.beads.end_mm.copy()
+    for place in (start, end):
+        place[tower] += [60.0, 0.0, 0.0]
+    beads = replace(job.beads, role=role, roles=roles, start_mm=start, end_mm=end)
+    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
+    site = sites(replace(job, beads=beads), template, here, SETUP)(plan_stops(job, [10])[0])
+    assert site.planned is not None
+    assert site.beside is not None
+    assert site.planned.bounds_mm[1, 0] < 130.0 < start[tower, 0].min()
+    assert site.beside.box_mm[0] > 130.0

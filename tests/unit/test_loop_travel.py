@@ -85,6 +85,15 @@ def test_whatever_a_job_has_pulled_a_repair_finds_the_nozzle_as_it_leaves_it(
     )
 
 
+def test_what_one_filament_was_pulled_is_not_another_s() -> None:
+    """regression: unloaded by 85 mm in the job and loaded by the machine, 85 mm were still back."""
+    head = HEAD + "G1 E-15 F6000\nG1 E-70 F1200\n"
+    assert pulled_back_mm(read_job(Program(head, "prusa")), head.count("\n")) == 85.0
+    for after, back_mm in (("T1\n", 0.0), ("T1\nG1 E20 F600\nG1 E-0.8 F2100\n", 0.8)):
+        job = read_job(Program(head + after, "prusa"))
+        assert pulled_back_mm(job, (head + after).count("\n")) == pytest.approx(back_mm)
+
+
 def test_filament_that_was_pulled_back_is_pushed_without_melting() -> None:
     """regression: 6 mm of a Bowden's retraction at 40 mm/s were 96 mm³/s to the checker.
 

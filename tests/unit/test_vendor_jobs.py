@@ -316,6 +316,36 @@ def test_a_job_s_own_material_is_that_of_the_filament_that_it_prints(
     assert setup.printer.retraction_mm == retraction_mm
 
 
+# As PrusaSlicer writes it for an MMU2S: pulled out, taken by T1, pushed in again on its tower.
+CHANGE = """G1 E-15 F6000
+G1 E-70 F1200
+T1
+G1 E12 F1140
+G1 X30 E42 F1163
+G1 X90 E6 F1163
+G1 X30 Y22 E3 F1163
+G1 X80 Y80"""
+
+
+@pytest.mark.parametrize(
+    ("one", "another", "said"),
+    [
+        ("", "", []),
+        ("T1\n", "T2\n", ["another tool: T2", "pulls filament back and prints on"]),
+        ("T1\n", "", ["pulls filament back and prints on"]),
+        ("G1 X30 E42 F1163", "G1 X30 Y21 E42 F1163\nG1 X90 E200 F1163", ["bead too thick"]),
+    ],
+)
+def test_filaments_may_be_changed_at_one_nozzle(one: str, another: str, said: list[str]) -> None:
+    """regression: each job of several colours was refused at its first change."""
+    settings = {"filament_type": "PLA;PLA", "single_extruder_multi_material": "1"}
+    text = job(START, part=f"{PART}\n{CHANGE}\n{PART}".replace(one, another), **settings)
+    assert own_setup(text).printer.one_nozzle
+    found = refused(text)
+    assert len(found) == len(said)
+    assert all(words in one for words, one in zip(said, found, strict=True))
+
+
 @pytest.mark.parametrize("tool", ["T0", "T1"])
 def test_a_job_goes_on_with_the_head_that_printed(tool: str) -> None:
     """regression: T0 was not taken, which lies in its dock after a power loss; others were heated

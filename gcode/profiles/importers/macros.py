@@ -87,9 +87,7 @@ def head_used(text: str) -> int:
     return max(share, key=share.__getitem__, default=0)
 
 
-def of_head(
-    values: Mapping[str, str], head: int, filament_keys: Collection[str]
-) -> dict[str, str]:
+def of_head(values: Mapping[str, str], head: int, filament_keys: Collection[str]) -> dict[str, str]:
     """A job's settings with those of one head, or filament, where a value is told for each.
 
     Parameters
