@@ -47,11 +47,15 @@ BESIDE_THE_PART = TOWERS | frozenset(
     }
 )  # fmt: skip
 THING_STEP_MM, THING_CELL_MM = 0.8, 0.2
-# By more, a job lays its walls elsewhere than its part has them: 30 that do not, by 0.03 at most.
+# By more, a job lays its walls elsewhere than its part has them: 42 that do not, by 0.03 at most.
 MOVED_MM, MOST_MOVES = 0.04, 5
+# What users and makers of filaments tell slicers: hundredths of a millimetre, tenths of a per cent.
+USUAL_MOVE_MM, USUAL_STRETCH = 0.1, 0.005
+WALLS_TELL_RATIO = 0.3  # how exactly all walls together tell it, of a usual move
+MOST_STRETCH = 0.02  # polypropylene's; more is another scale
 # Of its height, a bead is wider by so much than a rectangle: half of what round sides make, since
 # some slicers reckon with those and some without.
-ROUND_SIDES = 0.5 * (1.0 - math.pi / 4.0)
+BEAD_SIDES_RATIO = 0.5 * (1.0 - math.pi / 4.0)
 OFF_LAYERS = 1.5  # walls tell the height to about a layer; a raft has two and more
 UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
 
@@ -227,8 +231,8 @@ def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform |
         with suppress(AlignmentError):
             guess = Transform("build", "template", beside).inverse()
             there = align(walls, inset, guess=guess).template_from_scan.inverse()
-            placed, _, off_mm = _as_moved(walls, inset, there)
-            if off_mm < 0.5 * layer_height_mm:
+            placed, moved = _as_moved(walls, inset, there)
+            if moved.off_mm < 0.5 * layer_height_mm:
                 return placed
     try:
         found = align(walls, inset)
@@ -239,61 +243,113 @@ def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform |
         ) from error
     alike = (found.template_from_scan, *found.symmetric_alternatives)
     placed = max((pose.inverse() for pose in alike), key=lambda pose: float(np.trace(pose.matrix)))
-    placed, outside_mm, off_mm = _as_moved(walls, inset, placed)
-    if off_mm > 0.5 * layer_height_mm or abs(outside_mm) > inset.depth_mm:
+    placed, moved = _as_moved(walls, inset, placed)
+    if (
+        moved.off_mm > 0.5 * layer_height_mm
+        or abs(moved.outside_mm) > inset.depth_mm
+        or abs(moved.stretch) > MOST_STRETCH
+    ):
         raise AlignmentError(
-            f"the job's walls lie {outside_mm:+.3f} mm outside the template's and {off_mm:.3f} mm "
-            f"off that, the limits are half a bead ({inset.depth_mm:.2g} mm) and half a layer "
-            f"({0.5 * layer_height_mm:g} mm); is it this part, at this scale?"
+            f"the job's walls lie {moved.outside_mm:+.3f} mm outside the template's, are stretched "
+            f"by {100.0 * moved.stretch:+.1f} % and lie {moved.off_mm:.3f} mm off that; the limits "
+            f"are half a bead ({inset.depth_mm:.2g} mm), {100.0 * MOST_STRETCH:g} % and half a "
+            f"layer ({0.5 * layer_height_mm:g} mm); is it this part, at this scale?"
         )
     return placed
 
 
-def _as_moved(walls: Scan, inset: _Inset, placed: Transform) -> tuple[Transform, float, float]:
-    """The pose with all walls moved alike, how far outside they lie, and how far each off that."""
-    outside_mm, off_mm = _off_mm(walls, inset, placed)
-    more_mm = outside_mm
-    for _ in range(MOST_MOVES):
-        if abs(more_mm) < MOVED_MM:
-            break
-        moved = replace(inset, depth_mm=inset.depth_mm - outside_mm)
-        placed = align(walls, moved, guess=placed.inverse()).template_from_scan.inverse()
-        more_mm, off_mm = _off_mm(walls, moved, placed)
-        outside_mm += more_mm
-    return placed, outside_mm, off_mm
-
-
-def _off_mm(walls: Scan, inset: _Inset, placed: Transform) -> tuple[float, float]:
-    """How far outside the template's all walls lie, and the median of how far each lies off that.
+@dataclass(frozen=True, slots=True)
+class _Walls:
+    """A job's walls, and how its slicer has moved them from where the part has them.
 
     Slicers move all walls by what their user tells them ('XY compensation', 'horizontal
-    expansion'), so that holes and shafts of a printer that lays too much fit. Of walls all around
-    the mean is the same wherever the part is put.
+    expansion'), so that holes and shafts of a printer that lays too much fit, and stretch what
+    shrinks as it cools.
+
+    Attributes
+    ----------
+    outside_mm, stretch
+        How far outwards all of them were moved, and by what share X and Y are longer.
+    off_mm
+        How far each lies off that, the median.
     """
-    outside_mm = inset.distance(placed.inverse().apply(walls.points_mm))
-    all_mm = float(np.clip(outside_mm, -inset.depth_mm, inset.depth_mm).mean())
-    return all_mm, float(np.median(np.abs(outside_mm - all_mm)))
+
+    laid: Scan
+    outside_mm: float = 0.0
+    stretch: float = 0.0
+    off_mm: float = math.inf
+
+    @property
+    def half_mm(self) -> float:
+        """Half of how far they go in X or Y."""
+        return 0.5 * float(np.ptp(self.laid.points_mm[:, :2], axis=0).max())
+
+    @property
+    def unstretched(self) -> Scan:
+        """Where they would lie without the stretch, their middle where it is."""
+        points = self.laid.points_mm.copy()
+        middle = box_of(points).mean(axis=0)[:2]
+        points[:, :2] = middle + (points[:, :2] - middle) / (1.0 + self.stretch)
+        return replace(self.laid, points_mm=points)
+
+    def told_off(self, inset: _Inset, placed: Transform) -> _Walls:
+        """What else has moved them, where the part is placed so, is added to what is known.
+
+        Of walls all around, what a wrong place moves cancels out.
+        """
+        points = placed.inverse().apply(self.unstretched.points_mm)
+        moved = replace(inset, depth_mm=inset.depth_mm - self.outside_mm)
+        off_mm, gradient = moved.distance_and_gradient(points)
+        far_mm = np.einsum(
+            "ij,ij->i", (points - box_of(points).mean(axis=0))[:, :2], gradient[:, :2]
+        )
+        near_mm = np.clip(off_mm, -inset.depth_mm, inset.depth_mm)
+        told = np.column_stack([np.full(len(far_mm), USUAL_MOVE_MM), USUAL_STRETCH * far_mm])
+        # as points along a wall are off together, they tell no more than a few of them would
+        prior = np.eye(2) * len(told) * (WALLS_TELL_RATIO * USUAL_MOVE_MM) ** 2
+        share = np.linalg.solve(told.T @ told + prior, told.T @ near_mm)
+        return replace(
+            self,
+            outside_mm=self.outside_mm + USUAL_MOVE_MM * share[0],
+            stretch=self.stretch + USUAL_STRETCH * share[1],
+            off_mm=float(np.median(np.abs(off_mm - told @ share))),
+        )
+
+
+def _as_moved(laid: Scan, inset: _Inset, placed: Transform) -> tuple[Transform, _Walls]:
+    """The pose, and how the walls were moved."""
+    walls = _Walls(laid)
+    for _ in range(MOST_MOVES):
+        more = walls.told_off(inset, placed)
+        change_mm = abs(more.outside_mm - walls.outside_mm)
+        change_mm += walls.half_mm * abs(more.stretch - walls.stretch)
+        walls = more
+        if change_mm < MOVED_MM:
+            break
+        moved = replace(inset, depth_mm=inset.depth_mm - walls.outside_mm)
+        found = align(walls.unstretched, moved, guess=placed.inverse())
+        placed = found.template_from_scan.inverse()
+    return placed, walls
 
 
 def walls_moved_mm(job: Job, template: Template, placed: Transform) -> float:
-    """How far outside the template's a job lays all outer walls, the median; 0 where none is known.
+    """How far a job moves a part's outer walls, at most; 0 where none of its beads is known as one.
 
-    Below 0 it makes the part smaller, and its holes wider.
+    Outwards or inwards, by what it moves all of them and stretches X and Y.
     """
     beads = job.beads
     pick = (beads.layer >= 0) & of_roles(beads, OUTER_WALLS)
     if not pick.any():
         return 0.0
-    points, owner = places_along(beads.start_mm[pick], beads.end_mm[pick], THING_STEP_MM)
-    points[:, 2] -= 0.5 * beads.height_mm[pick][owner]
-    outside_mm = template.distance(placed.inverse().apply(points))
-    return float(np.median(outside_mm + _half_beads_mm(beads, pick)[owner]))
+    inset = _Inset(template, float(np.median(_half_beads_mm(beads, pick))))
+    walls = _Walls(_walls(beads, np.flatnonzero(pick))).told_off(inset, placed)
+    return abs(walls.outside_mm) + abs(walls.stretch) * walls.half_mm
 
 
 def _half_beads_mm(beads: Beads, pick: Mask) -> Float[np.ndarray, " k"]:
     """(k,) of some beads, as slicers reckon them."""
     height_mm = np.maximum(beads.height_mm[pick], 1e-6)
-    return np.asarray(0.5 * (beads.section_mm2[pick] / height_mm + ROUND_SIDES * height_mm))
+    return np.asarray(0.5 * (beads.section_mm2[pick] / height_mm + BEAD_SIDES_RATIO * height_mm))
 
 
 def _nth(number: int) -> str:

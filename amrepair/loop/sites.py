@@ -92,7 +92,7 @@ def sites(
     def ends_otherwise() -> bool:
         return by_beads and (
             _left_open(job, template, build_from_template)
-            or abs(walls_moved_mm(job, template, build_from_template)) > MOVED_MM
+            or walls_moved_mm(job, template, build_from_template) > MOVED_MM
         )
 
     return _expected(job, template, build_from_template, setup, by_beads, detector, ends_otherwise)
