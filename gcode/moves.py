@@ -49,11 +49,6 @@ class Extrude:
     height_mm: float
 
     @property
-    def length_mm(self) -> float:
-        """Length of the chain, mm."""
-        return float(np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1).sum())
-
-    @property
     def volume_mm3(self) -> float:
         """Plastic in the chain, mm³."""
         lengths_mm = np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)
@@ -167,9 +162,6 @@ class Toolpath:
 
     def __iter__(self) -> Iterator[Move]:
         return iter(self.moves)
-
-    def __len__(self) -> int:
-        return len(self.moves)
 
     @property
     def extrusions(self) -> tuple[Extrude, ...]:

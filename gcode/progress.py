@@ -14,7 +14,6 @@ class Progress(Protocol):
 
     def __call__(self, stage: str, done: float, total: float) -> None:
         """Report that `done` of `total` (any unit) of `stage` is finished."""
-        ...
 
 
 def silent(stage: str, done: float, total: float) -> None:

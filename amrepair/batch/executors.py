@@ -22,11 +22,9 @@ class Executor(Protocol):
 
     def outcomes(self, tasks: Iterator[Task]) -> Iterator[TaskOutcome]:
         """An outcome for each task, as they are done."""
-        ...
 
     def close(self) -> None:
         """Let the workers go; what they were doing is dropped."""
-        ...
 
 
 class Serial:

@@ -39,19 +39,15 @@ class ResultFolder(Protocol):
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file whole or not at all."""
-        ...
 
     def read(self, name: str) -> bytes:
         """All of a file."""
-        ...
 
     def names(self, folder: str) -> set[str]:
         """Names of the files in a folder; none where there is no folder."""
-        ...
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
         """Keep other batches out, where that can be done."""
-        ...
 
 
 class Folder:

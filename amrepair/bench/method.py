@@ -79,11 +79,9 @@ class Model(Protocol):
     @property
     def template_distance(self) -> CloudDistance | None:
         """How far the method's repair template is from the normal shape; None without one."""
-        ...
 
     def score(self, points_mm: Points, rng: np.random.Generator) -> Scores:
         """Score a cloud, whatever its pose."""
-        ...
 
 
 @runtime_checkable
@@ -92,7 +90,6 @@ class Method(Protocol):
 
     def fit(self, data: ClassInput, *, seed: int, cache: Path) -> Model:
         """Fit; `cache` is a folder for what other seeds or methods may use again."""
-        ...
 
 
 def class_input(one: BenchClass, format: str) -> ClassInput:

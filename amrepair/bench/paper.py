@@ -110,12 +110,6 @@ def make_pam_aligner(data: ClassInput, seed: int, cache: Path) -> Aligner:
     return place
 
 
-def top_mean(score: Values, count: int) -> float:
-    """Mean of the `count` highest scores."""
-    count = min(count, len(score))
-    return float(np.partition(score, len(score) - count)[len(score) - count :].mean())
-
-
 @dataclass(frozen=True, slots=True)
 class PaperModel:
     """A network and PAM."""
@@ -134,9 +128,9 @@ class PaperModel:
             matrix, aligned = error.matrix, False
         placed = moved(points_mm, matrix)
         score = np.abs(self.template.distance(placed))
-        return Scores(
-            score, top_mean(score, TOP_SCORES), self.target.residual(placed), aligned=aligned
-        )
+        rest = max(0, len(score) - TOP_SCORES)
+        top = float(np.partition(score, rest)[rest:].mean())
+        return Scores(score, top, self.target.residual(placed), aligned=aligned)
 
 
 @dataclass(frozen=True, slots=True)

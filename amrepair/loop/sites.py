@@ -208,13 +208,7 @@ def _beside(job: Job, which: Mask) -> HeightField | None:
     pick = which & of_roles(beads, BESIDE_THE_PART)
     if not pick.any():
         return None
-    return _as_high_as(job, pick, STRINGS_MM)
-
-
-def _as_high_as(job: Job, pick: Mask, wider_mm: float) -> HeightField:
-    """How high some of a job's beads stand, build frame; −inf farther than that beside them."""
-    beads = job.beads
-    within_mm = _half_widths_mm(beads, pick) + wider_mm
+    within_mm = _half_widths_mm(beads, pick) + STRINGS_MM
     low, shape = columns_around(
         beads.start_mm[pick], beads.end_mm[pick], float(within_mm.max()), BESIDE_CELL_MM
     )

@@ -16,7 +16,7 @@ from amrepair.merge.fit import rows_of_scans, said_outvoted
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, MeshSdf
 from amrepair.template.fit import fit_fast
-from amrepair.template.sound import SoundOptions, SoundParts, learn
+from amrepair.template.sound import SoundParts, learn
 from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -59,7 +59,6 @@ def learn_from_scans(
     scans: Sequence[Scan],
     mesh: trimesh.Trimesh,
     *,
-    options: SoundOptions | None = None,
     seed: int = 0,
     progress: Progress = silent,
 ) -> SoundFit:
@@ -98,7 +97,7 @@ def learn_from_scans(
     laid = [k for k, pose in enumerate(poses) if pose is not None]
     placed = [moved(scans[k].points_mm, pose) for k in laid if (pose := poses[k]) is not None]
     progress("learn from sound scans", 0.0, 1.0)
-    learned, sound = learn(prior, placed, options)
+    learned, sound = learn(prior, placed)
     progress("learn from sound scans", 1.0, 1.0)
     notes = _notes(scans, laid, left_out, sound)
     learned = replace(learned, metadata={**learned.metadata, "notes": "; ".join(notes)})

@@ -21,26 +21,10 @@ from amrepair.scans import range_grid_kernels as kernels
 EDGE, FLYING = kernels.EDGE, kernels.FLYING
 Kind = Literal["perspective", "orthographic", "pushbroom", "unknown"]
 NO_POINT = -1
-
-
-@dataclass(frozen=True, slots=True)
-class EdgeOptions:
-    """What counts as a jump of depth.
-
-    Attributes
-    ----------
-    most_incidence_deg
-        Two neighbours are one surface where it would be seen under at most this angle from its
-        normal. Beyond 80° few sensors get a signal back, and what comes is unsure; `detect` stops
-        believing its rays there too.
-    """
-
-    most_incidence_deg: float = 80.0
-
-    @property
-    def steepest(self) -> float:
-        """Depth over lateral distance at that angle."""
-        return float(np.tan(np.deg2rad(self.most_incidence_deg)))
+STEEPEST = float(np.tan(np.deg2rad(80.0)))
+"""Depth over lateral distance up to which two neighbours are one surface: beyond 80° from its
+normal few sensors get a signal back, and what comes is unsure; `detect` stops believing its rays
+there too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +97,6 @@ def edge_flags(
     grids: tuple[RangeGrid, ...],
     sensors_mm: Float[np.ndarray, "k 3"] | None = None,
     sensor_index: Numbers | None = None,
-    options: EdgeOptions | None = None,
 ) -> UInt8[np.ndarray, " n"]:
     """Which points lie at an edge, and which of them fly.
 
@@ -135,13 +118,12 @@ def edge_flags(
     -------
     (n,) bits; 0 for points that no grid holds.
     """
-    options = options or EdgeOptions()
     flags = np.zeros(len(points_mm), np.uint8)
     for grid in grids:
         seen = depths_of(points_mm, grid, sensors_mm, sensor_index)
         if seen is not None:
             kernels.mark_edges(
-                grid.index, seen.depth, seen.spacing, seen.row_ratio, options.steepest, flags
+                grid.index, seen.depth, seen.spacing, seen.row_ratio, STEEPEST, flags
             )
     return flags
 

@@ -60,7 +60,6 @@ class Scanner(Protocol):
     @property
     def build_from_scanner(self) -> Transform:
         """Calibrated pose."""
-        ...
 
     def scan(self, request: ScanRequest) -> Scan:
         """Measure what stands on the bed now.
@@ -70,4 +69,3 @@ class Scanner(Protocol):
         ScannerError
             If no usable scan arrives in time.
         """
-        ...

@@ -26,7 +26,7 @@ from jaxtyping import Float, Int
 from amrepair.arrays import Points, Vector
 from amrepair.frames import diagonal
 from amrepair.scans import range_grid_kernels as kernels
-from amrepair.scans.range_grid import EdgeOptions, Kind, RangeGrid, depths_of
+from amrepair.scans.range_grid import STEEPEST, Kind, RangeGrid, depths_of
 
 # A sensor at infinity stands this far away: its rays over a bed are parallel to a micrometre.
 INFINITY_MM = 10_000.0
@@ -149,9 +149,7 @@ class _Fit:
     slits: _Slits | None = None
 
 
-def viewpoint_of(
-    points_mm: Points, grid: RangeGrid, options: ViewpointOptions | None = None
-) -> Viewpoint | None:
+def viewpoint_of(points_mm: Points, grid: RangeGrid) -> Viewpoint | None:
     """The sensor of a grid, by the model of its rays that fits.
 
     Perspective: the origin. Orthographic: far along z, on the side from which the seen surface
@@ -163,7 +161,7 @@ def viewpoint_of(
     -------
     None where no model fits, two fit alike, or the side is not told: as a file that says nothing.
     """
-    options = options or ViewpointOptions()
+    options = ViewpointOptions()
     seen = _pixels(points_mm, grid, options.most_points)
     if seen is None:
         return None
@@ -305,7 +303,7 @@ def _far_away(points_mm: Points, grid: RangeGrid, options: ViewpointOptions) -> 
         -points_mm[:, 2].copy(),  # depth for a sensor above: falling z is growing depth
         seen.spacing,
         seen.row_ratio,
-        EdgeOptions().steepest,
+        STEEPEST,
         options.rim_slope,
     )
     told = falls + rises

@@ -77,13 +77,10 @@ class RecordingOptions:
         A residual beyond is another surface's point, or none.
     steepest_deg
         Depth that changes faster than on such a slope is an edge.
-    clip_sigmas
-        Pairs are compared within: a few points far off would say all.
     """
 
     farthest_mm: float = 5.0
     steepest_deg: float = 80.0
-    clip_sigmas: float = 3.0
 
 
 USUAL_RECORDING = RecordingOptions()

@@ -20,11 +20,9 @@ class Distances(Protocol):
 
     def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance at (n, 3) points, mm, negative inside."""
-        ...
 
     def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         """(n,) signed distance, mm, and its (n, 3) gradient (unit outward normal near f = 0)."""
-        ...
 
 
 @runtime_checkable
@@ -34,26 +32,21 @@ class Template(Distances, Protocol):
     @property
     def bounds_mm(self) -> Box:
         """(2, 3) lowest and highest corner of the part, template frame."""
-        ...
 
     @property
     def bias_mm(self) -> float:
         """How far the field's zero level may lie from the true surface (99th percentile)."""
-        ...
 
     def below_z(self, z_mm: float) -> Template:
         """The part printed so far: max(f, z − z_k)."""
-        ...
 
     def surface_points(
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
         """(m, 3) points on the zero level about `spacing_mm` apart, and (m, 3) unit normals."""
-        ...
 
     def solid(self) -> object:
         """The interior as a `manifold3d.Manifold`, template frame, checked watertight."""
-        ...
 
 
 @runtime_checkable
@@ -63,7 +56,6 @@ class OnGrid(Protocol):
     @property
     def grid_numbers(self) -> tuple[Any, ...]:
         """What `trilinear_kernels.field_at` takes after a point."""
-        ...
 
 
 def is_off_bed(template: Template) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -22,9 +21,8 @@ from gcode.progress import Progress, silent
 class FilePrinter:
     """Writes programs to `path`, whole or not at all."""
 
-    def __init__(self, path: Path, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._clock = clock
         self._file: IO[str] | None = None
         self._temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
 
@@ -81,7 +79,7 @@ class FilePrinter:
         require_checked(checked)
         if self._file is None:
             raise LinkError(f"{self.path} is not open; call connect() first.")
-        start_s = self._clock()
+        start_s = time.monotonic()
         text = checked.program.text
         whole = text.count("\n") + (not text.endswith("\n"))  # no line follows the last newline
         first, end = (0, whole) if lines is None else (lines.start, min(lines.stop, whole))
@@ -91,7 +89,7 @@ class FilePrinter:
             written += bool(line.partition(";")[0].strip())
             size += len(line) + 1
         progress("writing", 1.0, 1.0)
-        seconds = self._clock() - start_s
+        seconds = time.monotonic() - start_s
         return PrintReport(True, written, size, seconds, next_line=end, first_line=first)
 
     def finish_moves(self) -> None:

@@ -26,11 +26,9 @@ class PrintableProgram(Protocol):
     @property
     def program(self) -> Program:
         """The program's text and dialect."""
-        ...
 
     def lines(self, first: int, end: int) -> Sequence[str]:
         """Lines of the half-open range [first, end)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +99,6 @@ class PullsAtRest(Protocol):
 
     def pulled_at_rest_mm(self) -> float:
         """Filament that the pause has pulled back, beyond what the job had."""
-        ...
 
 
 @runtime_checkable
@@ -169,23 +166,18 @@ class Printer(Protocol):
         PortBusyError
             If another sender holds it.
         """
-        ...
 
     def close(self) -> None:
         """Let go of the printer; harmless when not connected."""
-        ...
 
     def capabilities(self) -> Capabilities:
         """Return what the firmware says it can do."""
-        ...
 
     def temperatures(self) -> Temperatures:
         """Ask for temperatures."""
-        ...
 
     def position_mm(self) -> tuple[float, float, float]:
         """Ask for the logical position, mm."""
-        ...
 
     def print(
         self,
@@ -205,31 +197,24 @@ class Printer(Protocol):
         PrinterError
             If the printer reports a fault of its own.
         """
-        ...
 
     def finish_moves(self) -> None:
         """Return when every buffered move has been made (M400)."""
-        ...
 
     def pause(self) -> None:
         """Stop after the line under way, lift the nozzle; from another thread than `print`."""
-        ...
 
     def resume(self) -> None:
         """Go back to where the pause began and go on."""
-        ...
 
     def abort(self) -> None:
         """End the job: nothing more is sent, heaters off, nozzle lifted."""
-        ...
 
     def emergency_stop(self) -> None:
         """Stop everything now; the printer must be reset afterwards."""
-        ...
 
     def heaters_off(self) -> None:
         """Switch hotend, bed and fan off."""
-        ...
 
 
 @runtime_checkable

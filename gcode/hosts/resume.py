@@ -78,7 +78,6 @@ def back_to_start(
     release_c: float,
     pose_confirmed: bool = False,
     before: Sequence[tuple[PrintableProgram, int, int]],
-    wall_clock: Callable[[], float] = time.time,
 ) -> None:
     """Have the machine where the journal's last job began, which can begin anew; or refuse.
 
@@ -98,7 +97,7 @@ def back_to_start(
         Naming the interval; the heaters have been told to switch off.
     """
     _Resumption(
-        printer, checked, release_c, pose_confirmed, wall_clock, end=None, before=before, anew=True
+        printer, checked, release_c, pose_confirmed, time.time, end=None, before=before, anew=True
     ).prepared()
 
 

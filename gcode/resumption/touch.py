@@ -103,7 +103,6 @@ def plan_touch(
     above_mm: float,
     z_mm: float | None = None,
     layer: int | None = None,
-    options: TouchOptions | None = None,
     progress: Progress = silent,
 ) -> Touching:
     """Plan how Z is found anew on what stands of a job.
@@ -111,7 +110,7 @@ def plan_touch(
     Parameters
     ----------
     above_mm
-        How high the nozzle stands above the part's top now, by eye, within `options.doubt_mm`.
+        How high the nozzle stands above the part's top now, by eye, within `TouchOptions.doubt_mm`.
     z_mm, layer
         As for `resume_at`: height of what stands there, or the first layer to be printed.
 
@@ -123,7 +122,7 @@ def plan_touch(
     CheckRefusedError
         If the checker refuses the touches.
     """
-    printer, options = setup.printer, options or TouchOptions()
+    printer, options = setup.printer, TouchOptions()
     _refuse_impossible(printer, above_mm, options)
     job = read_job(program, filament_diameter_mm=printer.filament_diameter_mm, progress=progress)
     first = first_layer(job, z_mm, layer)
