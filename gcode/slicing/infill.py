@@ -95,9 +95,11 @@ def _lines_up_to_the_rim(
 def sparse_fill(
     region: Any, *, spacing_mm: float, ratio: float, layer: int, pattern: str
 ) -> list[Bead]:
-    """Lines that cover `ratio` of `region`; grid crosses itself in each layer."""
+    """Lines or rings that cover `ratio` of `region`; grid crosses itself in each layer."""
     if region.is_empty() or ratio <= 0:
         return []
+    if pattern == "concentric":
+        return _sparse_rings(region, spacing_mm, spacing_mm / ratio)
     inner = offset(region, -0.5 * spacing_mm)
     angles: tuple[float, ...]
     if pattern == "grid":
@@ -114,6 +116,15 @@ def sparse_fill(
             share_mm=spacing_mm,
             connect_mm=0.0,
         )
+    return beads
+
+
+def _sparse_rings(region: Any, spacing_mm: float, apart_mm: float) -> list[Bead]:
+    beads: list[Bead] = []
+    ring = offset(region, -0.5 * apart_mm)
+    while not ring.is_empty():
+        beads += _loops(ring, spacing_mm, Role.SPARSE_INFILL)
+        ring = offset(ring, -apart_mm)
     return beads
 
 
@@ -174,7 +185,7 @@ def ring_beads(
     centre: Any, area_mm2: float, spacing_mm: float, role: Role, options: FillOptions
 ) -> list[Bead]:
     """Closed beads along a ring's centre, weighed to the ring's area."""
-    loops = [loop_bead(np.asarray(c), spacing_mm, role) for c in centre.to_polygons() if len(c) > 2]
+    loops = _loops(centre, spacing_mm, role)
     laid_mm2 = sum(bead.area_mm2 for bead in loops)
     if laid_mm2 <= 0:
         return []
@@ -195,3 +206,7 @@ def _thin(region: Any, bore_mm: float, options: FillOptions) -> tuple[list[Bead]
         lost_mm2 += thin.lost_mm2
         found_mm2 += part.area()
     return beads, lost_mm2 + max(0.0, region.area() - found_mm2)
+
+
+def _loops(centre: Any, share_mm: float, role: Role) -> list[Bead]:
+    return [loop_bead(np.asarray(c), share_mm, role) for c in centre.to_polygons() if len(c) > 2]

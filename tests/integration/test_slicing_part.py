@@ -117,3 +117,25 @@ def test_layers_are_the_same_whoever_plans_them(setup: PrintSetup, infill_ratio:
         for part, workers in ((solid, 1), (closed_mesh(solid), 1), (solid, 2))
     }
     assert len(texts) == 1
+
+
+@pytest.mark.parametrize("infill_ratio", [1.0, 0.2])
+def test_a_concentric_infill_is_rings_about_the_middle(
+    setup: PrintSetup, infill_ratio: float
+) -> None:
+    """regression: where it was sparse, it was straight lines."""
+    told = {"infill_ratio": infill_ratio, "infill_pattern": "concentric"}
+    setup = replace(setup, process=setup.process.model_copy(update=told))
+    disc = m3.Manifold.cylinder(4.0, 12.0, 12.0, 256).translate((100.0, 100.0, 0.0))
+    beads = _beads(disc, setup)
+    inside = [bead for bead in beads if bead.points_mm[0, 2] == pytest.approx(2.0)]
+    role = Role.SOLID_INFILL if infill_ratio == 1.0 else Role.SPARSE_INFILL
+    rings = [bead for bead in inside if bead.role is role]
+    assert len(rings) >= 5
+    for ring in rings:
+        assert len(ring.points_mm) > 20  # both ends of a chord are as far from the middle, too
+        away_mm = np.linalg.norm(ring.points_mm[:, :2] - 100.0, axis=1)
+        assert np.ptp(away_mm) < 0.05  # a chord's sagitta and simplified corners
+    walls_mm = 2 * setup.process.line_width_mm
+    core_mm3 = np.pi * (12.0 - walls_mm) ** 2 * 0.2
+    assert sum(ring.volume_mm3 for ring in rings) == pytest.approx(infill_ratio * core_mm3, rel=0.1)
