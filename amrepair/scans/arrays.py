@@ -72,54 +72,14 @@ def _promised(file: Any) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
     return shape, dtype
 
 
-def read_npz(
-    path: Path,
-    frame: str,
-    sigma_mm: float,
-    cell_mm: float | None,
-    origin_mm: tuple[float, float] | None,
-) -> Scan:
-    """An archive with `points_mm`, or a height map with `z_mm`.
+def read_archive(path: Path) -> dict[str, Shaped[np.ndarray, " ..."]]:
+    """All arrays of an archive, by name; sizes are held against its directory first.
 
     Raises
     ------
     InputError
-        If it is damaged, swells beyond the limit, or holds neither.
+        If it is damaged, swells beyond the limit, or an array holds no numbers.
     """
-    stored = _members(path)
-    if "z_mm" in stored:
-        return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
-    points = stored.get("points_mm", stored.get("points"))
-    if points is None or points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: the archive needs points_mm (n, 3), it has {sorted(stored)}")
-    sensors, index = stored.get("sensors_mm"), stored.get("sensor_index")
-    normals = stored.get("normals")
-    if sensors is None or index is None:
-        sensors = index = None
-    elif (
-        sensors.ndim != 2 or sensors.shape[1] != 3 or index.shape != (len(points),)
-        or not len(index) or not 0 <= int(index.min()) <= int(index.max()) < len(sensors)
-    ):  # fmt: skip
-        raise InputError(
-            f"{path}: sensors_mm (k, 3) and sensor_index (n,) have shapes {sensors.shape} and "
-            f"{index.shape}, or an index names no sensor"
-        )
-    sigma = stored.get("sigma_mm", np.array(sigma_mm))
-    if sigma.size != 1 or (normals is not None and normals.shape != points.shape):
-        raise InputError(f"{path}: sigma_mm is one number, normals are as many as points")
-    return Scan(
-        points.astype(np.float64),
-        float(sigma.reshape(())),
-        frame,
-        None if normals is None else normals.astype(np.float64),
-        None if sensors is None else sensors.astype(np.float64),
-        None if index is None else index.astype(np.int64),
-        str(path),
-    )
-
-
-def _members(path: Path) -> dict[str, Shaped[np.ndarray, " ..."]]:
-    """All arrays of an archive, by name; sizes are held against its directory first."""
     try:
         with zipfile.ZipFile(path) as archive:
             infos = [i for i in archive.infolist() if i.filename.endswith(".npy")]
@@ -158,7 +118,7 @@ def read_height_map(
     try:
         with refused_as_ours():
             if path.suffix.lower() == ".npz":
-                _members(path)  # may not swell; other kinds hold what they promise, or are refused
+                read_archive(path)  # may not swell; others hold what they promise, or are refused
             heights = HeightField.read(path, cell_mm=cell_mm, origin_mm=origin_mm)
         if not np.isfinite(heights.origin_mm).all() or not np.isfinite(heights.cell_mm):
             raise InputError(f"{path}: the height map's cell or origin is no finite number")

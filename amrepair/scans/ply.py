@@ -120,13 +120,13 @@ def millimetres_of(header: PlyHeader, path: Path, given_mm: float | None) -> flo
     return own_mm
 
 
-def sensors_of(header: PlyHeader) -> Float[np.ndarray, "k 3"] | None:
+def sensors_of(header: PlyHeader, path: Path) -> Float[np.ndarray, "k 3"] | None:
     """Sensor origins from `comment sensor_mm x y z` lines, in order; None without any."""
     found = [c.split()[1:4] for c in header.comments if c.startswith(SENSOR_COMMENT)]
     try:
         return np.array(found, dtype=np.float64).reshape(-1, 3) if found else None
-    except ValueError:
-        return None
+    except ValueError as e:
+        raise InputError(f"{path}: the PLY file's {SENSOR_COMMENT} is no three numbers") from e
 
 
 def write_ply(

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 
 from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import InputError, refused_as_ours
-from amrepair.scans.arrays import is_map, load_npy, read_height_map, read_npz
+from amrepair.scans.arrays import is_map, load_npy, read_archive, read_height_map
 from amrepair.scans.depth_map import read_depth_map
 from amrepair.scans.mesh import read_mesh
 from amrepair.scans.ply import millimetres_of, mm_per, read_grid, sensors_of, write_ply
@@ -122,7 +122,7 @@ def _read(
     if is_height:
         return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
     if suffix == ".npz":
-        return read_npz(path, frame, DEFAULT_SIGMA_MM, cell_mm, origin_mm)
+        return _read_npz(path, frame, cell_mm, origin_mm)
     if suffix == ".ply":
         return _read_ply(path, frame, given_mm)
     if suffix == ".pcd":
@@ -197,15 +197,60 @@ def _from_columns(
         # A cloud without normals may carry zeros or NaN in their place.
         if len(raw) and np.isfinite(length).all() and (length > 1e-6).mean() > 0.99:
             normals = raw / np.maximum(length, 1e-12)
-    index: Numbers | None = None
-    if sensors_mm is not None:
-        column = np.nan_to_num(columns.get("sensor", np.zeros(len(points))))
-        index = np.clip(column, 0, len(sensors_mm) - 1).astype(np.int64)
+    index = None if sensors_mm is None else _which_sensor(columns, len(sensors_mm), path)
     edge: UInt8[np.ndarray, " n"] | None = None
     if "edge" in columns:
         edge = np.clip(np.nan_to_num(columns["edge"]), 0, 255).astype(np.uint8)
     grids = None if grid is None else (grid,)
     return Scan(points, sigma_mm, frame, normals, sensors_mm, index, str(path), grids, edge)
+
+
+def _which_sensor(columns: dict[str, Values], sensors: int, path: Path) -> Numbers:
+    """(n,) which of the file's sensors saw each point."""
+    if "sensor" not in columns:
+        if sensors != 1:  # a wrong ray would cross the part and call it empty, so none is guessed
+            raise InputError(
+                f"{path}: the file names {sensors} sensors, and not which of them saw each point; "
+                "write that into it, too, or one sensor"
+            )
+        return np.zeros(len(columns["x"]), np.int64)
+    told = columns["sensor"]
+    if not ((told >= 0) & (told < sensors)).all():
+        raise InputError(f"{path}: points name sensors that are none of the file's {sensors}")
+    return told.astype(np.int64)
+
+
+def _read_npz(
+    path: Path, frame: str, cell_mm: float | None, origin_mm: tuple[float, float] | None
+) -> Scan:
+    """An archive with `points_mm` (and `normals`, `sigma_mm`, sensors), or a map with `z_mm`."""
+    stored = read_archive(path)
+    if "z_mm" in stored:
+        return read_height_map(path, frame=frame, cell_mm=cell_mm, origin_mm=origin_mm)
+    points = stored.get("points_mm", stored.get("points"))
+    if points is None or points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{path}: the archive needs points_mm (n, 3), it has {sorted(stored)}")
+    normals, sensors = stored.get("normals", points), stored.get("sensors_mm", np.zeros((1, 3)))
+    index = stored.get("sensor_index", points[:, 0])
+    sigma = stored.get("sigma_mm", np.array(DEFAULT_SIGMA_MM))
+    if (
+        normals.shape != points.shape or index.shape != (len(points),)
+        or sensors.shape[1:] != (3,) or sigma.size != 1
+    ):  # fmt: skip
+        raise InputError(
+            f"{path}: normals are as many as points, sensors_mm is (k, 3), sensor_index (n,), and "
+            "sigma_mm one number"
+        )
+    columns = dict(zip("xyz", points.T.astype(np.float64), strict=True))
+    if "normals" in stored:
+        columns |= zip(("nx", "ny", "nz"), normals.T.astype(np.float64), strict=True)
+    if "sensor_index" in stored:
+        columns["sensor"] = index.astype(np.float64)
+    return _from_columns(
+        columns, path, frame,
+        sigma_mm=float(sigma.reshape(())),
+        sensors_mm=sensors.astype(np.float64) if "sensors_mm" in stored else None,
+    )  # fmt: skip
 
 
 def _read_ply(path: Path, frame: str, given_mm: float | None) -> Scan:
@@ -227,7 +272,7 @@ def _read_ply(path: Path, frame: str, given_mm: float | None) -> Scan:
         columns, grid = _without_gaps(columns, grid)
     return _from_columns(
         columns, path, frame,
-        sigma_mm=sigma_mm, sensors_mm=sensors_of(header), grid=grid, unit_mm=unit_mm,
+        sigma_mm=sigma_mm, sensors_mm=sensors_of(header, path), grid=grid, unit_mm=unit_mm,
     )  # fmt: skip
 
 

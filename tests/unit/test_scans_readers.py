@@ -223,6 +223,49 @@ def test_several_sensors_need_to_be_told_apart(tmp_path: Path) -> None:
     assert read_scan(path, frame="scanner", sensor_at=(0.0, 0.0, 300.0)).sensor_index is not None
 
 
+def test_an_archive_round_trip_keeps_everything(tmp_path: Path, scan: Scan) -> None:
+    """regression: normals of any length were taken as they were, and one sensor was dropped."""
+    path = tmp_path / "a.npz"
+    assert scan.normals is not None
+    said = {"points_mm": scan.points_mm, "normals": 3.0 * scan.normals, "sigma_mm": scan.sigma_mm}
+    np.savez(path, **said, sensors_mm=scan.sensors_mm, sensor_index=scan.sensor_index)
+    back = read_scan(path, frame="scanner")
+    assert np.array_equal(back.points_mm, scan.points_mm)
+    assert back.normals == pytest.approx(scan.normals)
+    assert back.sigma_mm == scan.sigma_mm
+    assert np.array_equal(back.sensors_mm, scan.sensors_mm)
+    assert np.array_equal(back.sensor_index, scan.sensor_index)
+    np.savez(path, points=scan.points_mm, sensors_mm=scan.sensors_mm[:1])
+    assert np.array_equal(read_scan(path, frame="scanner").sensor_index, np.zeros(50))
+
+
+def _ply_with_sensors(path: Path, column: list[int] | None) -> Path:
+    points = np.arange(9.0).reshape(3, 3).tolist()
+    rows = [[*xyz, *([] if column is None else column[k : k + 1])] for k, xyz in enumerate(points)]
+    head = [
+        "ply", "format ascii 1.0", "comment sensor_mm 0 0 300", "comment sensor_mm 300 0 300",
+        "element vertex 3", *(f"property float {axis}" for axis in "xyz"),
+        *([] if column is None else ["property int sensor"]), "end_header",
+    ]  # fmt: skip
+    path.write_text("\n".join([*head, *(" ".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("column", [None, [0, 1, 2], [0, -1, 1]], ids=str)
+def test_a_file_that_does_not_tell_its_sensors_apart_is_refused(
+    tmp_path: Path, column: list[int] | None
+) -> None:
+    """regression: its points were taken to be the first sensor's, or the last's."""
+    assert read_scan(_ply_with_sensors(tmp_path / "good.ply", [0, 1, 1]), frame="scanner")
+    with pytest.raises(InputError, match="sensor"):
+        read_scan(_ply_with_sensors(tmp_path / "a.ply", column), frame="scanner")
+    xyz, sensors = np.eye(3), np.array([[0.0, 0.0, 300.0], [300.0, 0.0, 300.0]])
+    told = {} if column is None else {"sensor_index": np.array(column)}
+    np.savez(tmp_path / "a.npz", points_mm=xyz, sensors_mm=sensors, **told)
+    with pytest.raises(InputError, match="sensor"):
+        read_scan(tmp_path / "a.npz", frame="scanner")
+
+
 @pytest.mark.parametrize("name", ["a.xyz", "a.ply", "a.pcd", "a.npy", "a.stl"])
 def test_a_unit_is_said_where_the_file_leaves_it_open(name: str, tmp_path: Path) -> None:
     box = trimesh.creation.box((0.04, 0.03, 0.02))
