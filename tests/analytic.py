@@ -38,12 +38,6 @@ class AnalyticTemplate:
         ]
         return self.field(np.asarray(points_mm, float)), np.stack(steps, axis=1)
 
-    def below_z(self, z_mm: float) -> AnalyticTemplate:
-        return AnalyticTemplate(
-            lambda p: np.maximum(self.field(p), p[:, 2] - z_mm),
-            self.body.trim_by_plane((0, 0, -1), -z_mm),
-        )
-
     def surface_points(self, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
         if spacing_mm not in self._cache:
             self._cache[spacing_mm] = sample_surface(self.body, spacing_mm, seed=1)

@@ -188,13 +188,13 @@ def mesh(
 ) -> None:
     """Extract the template's surface as a closed mesh."""
     with console.starting():
-        from amrepair.template import extract_mesh, open_template
+        from amrepair.template import CutTemplate, extract_mesh, open_template
 
     console.writable(output)
     bars = console.Bars()
     with bars.shown():
         template = open_template(file, progress=bars)
-        cut = template if below_z_mm is None else template.below_z(below_z_mm)
+        cut = template if below_z_mm is None else CutTemplate(template, below_z_mm)
         with bars.stage("extract"):
             made = extract_mesh(cut, voxel_mm, level_mm=level_mm)
             write_mesh(made, output)

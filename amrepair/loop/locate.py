@@ -82,9 +82,6 @@ class _Inset:
         distance, gradient = self.whole.distance_and_gradient(points_mm)
         return distance + self.depth_mm, gradient
 
-    def below_z(self, z_mm: float) -> Template:
-        return self.whole.below_z(z_mm)
-
     def surface_points(
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:

@@ -30,7 +30,7 @@ from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
 from amrepair.repair.site import Raft
-from amrepair.template import KeptFills, LaidBeads, PlannedSdf
+from amrepair.template import CutTemplate, KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import JobBridges
 from gcode.profiles import PrintSetup
@@ -139,7 +139,7 @@ def _expected(
         section, height = beads.section_mm2[judged], beads.height_mm[judged]
         planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
         recent = PlannedBeads.recent(start, end, section, height)
-        below = template.below_z(z_mm)
+        below = CutTemplate(template, z_mm)
         return Site(
             below,
             setup,

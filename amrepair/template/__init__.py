@@ -7,6 +7,7 @@ scans' poses, nor what is done about a difference. torch is imported only by `Pa
 one is fitted.
 """
 
+from amrepair.template.cut import CutTemplate
 from amrepair.template.extract import extract_mesh
 from amrepair.template.fitting import default_cache_dir, fit_template, load_or_fit, load_template
 from amrepair.template.grid import GridSdf
@@ -21,6 +22,7 @@ from amrepair.template.port import Template
 from amrepair.template.stood import StoodTemplate
 
 __all__ = [
+    "CutTemplate",
     "GridSdf",
     "KeptFills",
     "LaidBeads",

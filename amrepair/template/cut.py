@@ -68,10 +68,6 @@ class CutTemplate:
         spread = getattr(self.whole, "spread_mm", None)
         return np.zeros(len(points_mm)) if spread is None else np.asarray(spread(points_mm))
 
-    def below_z(self, z_mm: float) -> Template:
-        """The lower of the two cuts."""
-        return CutTemplate(self.whole, min(z_mm, self.z_mm))
-
     def surface_points(
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:

@@ -17,9 +17,7 @@ from jaxtyping import Float
 from amrepair.arrays import Box, Points, Values, Vector, VoxelMask, Voxels
 from amrepair.errors import TemplateError
 from amrepair.template import planned_kernels as kernels
-from amrepair.template.cut import CutTemplate
 from amrepair.template.options import USUAL_PLANNED, PlannedOptions
-from amrepair.template.port import Template
 from gcode.compiled import read_only
 
 
@@ -123,10 +121,6 @@ class PlannedSdf:
         """(n,) signed distance and (n, 3) its gradient, by central differences over a voxel."""
         points = read_only(points_mm, np.float64)
         return kernels.interpolate_with_gradient(points, self.origin_mm, self.voxel_mm, self._field)
-
-    def below_z(self, z_mm: float) -> Template:
-        """The beads printed so far, cut."""
-        return CutTemplate(self, z_mm)
 
     def surface_points(
         self, spacing_mm: float

@@ -37,9 +37,6 @@ class Template(Distances, Protocol):
     def bias_mm(self) -> float:
         """How far the field's zero level may lie from the true surface (99th percentile)."""
 
-    def below_z(self, z_mm: float) -> Template:
-        """The part printed so far: max(f, z − z_k)."""
-
     def surface_points(
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:

@@ -8,14 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Box
-from amrepair.template.cut import CutTemplate
 from amrepair.template.surface import mesh_points
 from gcode.solids import as_manifold
 
 if TYPE_CHECKING:
     import trimesh
-
-    from amrepair.template.port import Template
 
 
 class MeshShape:
@@ -28,10 +25,6 @@ class MeshShape:
     def bounds_mm(self) -> Box:
         """(2, 3) box of the part."""
         return np.array(self.mesh.bounds, dtype=np.float64)
-
-    def below_z(self, z_mm: float) -> Template:
-        """The part printed so far."""
-        return CutTemplate(self, z_mm)  # type: ignore[arg-type]  # distances are the field's
 
     def surface_points(
         self, spacing_mm: float

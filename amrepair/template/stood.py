@@ -15,7 +15,6 @@ from jaxtyping import Float
 
 from amrepair.arrays import Box, Numbers, Points, Values
 from amrepair.frames import Transform, box_of
-from amrepair.template.cut import CutTemplate
 from amrepair.template.port import Template
 from gcode.meshes import mesh_of
 
@@ -97,10 +96,6 @@ class StoodTemplate:
             nearer = found < distance[ask]
             distance[ask[nearer]], copy[ask[nearer]] = found[nearer], k
         return distance, copy
-
-    def below_z(self, z_mm: float) -> Template:
-        """What is printed so far."""
-        return CutTemplate(self, z_mm)
 
     def surface_points(
         self, spacing_mm: float

@@ -16,7 +16,7 @@ from amrepair.scans import ScanRequest
 from amrepair.simulate.parameters import load_world
 from amrepair.simulate.scanner import ScannerPose, SimulatedScanner, default_sensors_mm
 from amrepair.simulate.world import World
-from amrepair.template import MeshSdf
+from amrepair.template import CutTemplate, MeshSdf
 
 TOP_MM = 4.0
 WHOLE = m3.Manifold.cube((24.0, 18.0, 8.0)).translate((18.0, 21.0, 0.0))
@@ -43,7 +43,7 @@ def deficit_of(template: MeshSdf, standing: m3.Manifold, seed: int = 0) -> Defic
         rng=np.random.default_rng(seed),
     )
     scan = scanner.scan(ScanRequest("test", 19, TOP_MM)).moved(PLACE)
-    layer = template.below_z(TOP_MM)
+    layer = CutTemplate(template, TOP_MM)
     anomaly = detect(scan, layer, top_z_mm=TOP_MM)
     return compute_deficit(
         scan,
@@ -100,7 +100,7 @@ def test_reflections_near_what_stands_out_are_no_part_of_it(template: MeshSdf) -
         model=load_world().scanner().model_copy(update={"outlier_ratio": 0.005}),
     )
     scan = scanner.scan(ScanRequest("test", 3, thin_mm)).moved(PLACE)
-    layer = template.below_z(thin_mm)
+    layer = CutTemplate(template, thin_mm)
     found = compute_deficit(
         scan,
         layer,

@@ -30,7 +30,7 @@ from amrepair.loop.sites import sites
 from amrepair.regions import Label, Region, detect
 from amrepair.repair import plan_repair
 from amrepair.scans import Scan
-from amrepair.template import MeshSdf, StoodTemplate
+from amrepair.template import CutTemplate, MeshSdf, StoodTemplate
 from gcode.profiles import load_setup
 from gcode.reader import Job, job_for
 from gcode.slicing.job import plan_part
@@ -105,7 +105,7 @@ def test_a_part_sliced_lying_in_another_way_is_expected_as_it_lies(
     # what is printed so far, from the bed up, whichever way its file has it
     so_far = part.trim_by_plane((0.0, 0.0, -1.0), -3.0)
     points = trimesh.sample.sample_surface(solid_mesh(so_far), 400, seed=1)[0]
-    assert np.abs(expected.below_z(3.0).distance(np.asarray(points))).max() < 0.15
+    assert np.abs(CutTemplate(expected, 3.0).distance(np.asarray(points))).max() < 0.15
 
 
 def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from amrepair.errors import TemplateError
+from amrepair.template.cut import CutTemplate
 from amrepair.template.extract import extract_mesh
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.port import Template
@@ -79,7 +80,7 @@ def test_what_reaches_beyond_the_box_is_closed_there() -> None:
 
 
 def test_a_layer_is_cut_flat(ball: MeshSdf) -> None:
-    mesh = extract_mesh(ball.below_z(2.0), 0.4)
+    mesh = extract_mesh(CutTemplate(ball, 2.0), 0.4)
     assert mesh.is_watertight
     assert mesh.vertices[:, 2].max() == pytest.approx(2.0, abs=0.05)
 
