@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -53,11 +54,14 @@ def changed(options: PolicyOptions, rules: Sequence[str]) -> PolicyOptions:
         if name not in known:
             raise InputError(f"there is no rule '{name}'; there are: {', '.join(sorted(known))}")
         try:
-            known[name] = type(known[name])(value)
+            number = type(known[name])(value)
         except ValueError:
+            number = math.nan
+        if not math.isfinite(number):  # nothing is above or below what is no number
             raise InputError(
                 f"the rule '{rule}' has no number in it; say {name}={known[name]:g}, for example"
-            ) from None
+            )
+        known[name] = number
     return PolicyOptions(**known)
 
 

@@ -68,6 +68,9 @@ def test_facts_alone_lead_to_the_same_decisions_and_to_others_by_other_rules(
     first, second = decide_again(tmp_path, ["least_mm3=1000"])
     assert "decided 'fill now' by S9 then, 'go on' by S12 now" in first.differences
     assert not second.differences
-    for rule, said in (("least=2", "there is no rule 'least'"), ("sure=high", "has no number")):
+    for rule, said in (
+        ("least=2", "there is no rule 'least'"), ("sure=high", "has no number"),
+        ("sure=nan", "has no number"),  # regression: nothing was sure any more
+    ):  # fmt: skip
         with pytest.raises(InputError, match=said):
             decide_again(tmp_path, [rule])
