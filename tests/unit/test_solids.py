@@ -104,15 +104,15 @@ def test_an_stl_file_of_text_is_read(tmp_path: Path) -> None:
     assert read_solid(path).volume() == pytest.approx(24.0)
 
 
-def built(path: Path, item: str, unit: str = "") -> Path:
-    """A 3MF file of one cube of 10, used once."""
+def built(path: Path, item: str, unit: str = "", more: str = "") -> Path:
+    """A 3MF file of one cube of 10, used once, and more objects."""
     cube = trimesh.creation.box((10.0, 10.0, 10.0))
     vertices = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in cube.vertices)
     triangles = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in cube.faces)
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{triangles}</triangles></mesh>"
     model = (
         f'<model {unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
-        f'<resources><object id="1">{mesh}</object></resources><build>{item}</build></model>'
+        f'<resources><object id="1">{mesh}</object>{more}</resources><build>{item}</build></model>'
     )
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("3D/3dmodel.model", model)
@@ -140,6 +140,30 @@ def test_3mf_units_and_mirrored_uses(
     solid = read_solid(built(tmp_path / "cube.3mf", item, unit))
     assert solid.volume() > 0
     assert solid.bounding_box()[::3] == pytest.approx(box_mm)
+
+
+NESTED = (
+    '<object id="2"><components>'
+    '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 20 0 0"/></components></object>'
+)
+
+
+@pytest.mark.parametrize(
+    ("item", "middle_mm"),
+    [
+        # a quarter turn takes the component's shift along x to y
+        ('<item objectid="2" transform="0 1 0 -1 0 0 0 0 1 0 0 7"/>', (0.0, 20.0, 7.0)),
+        ("", (20.0, 0.0, 0.0)),  # nothing says what is built: what nothing else uses
+    ],
+    ids=["turned", "not built"],
+)
+def test_3mf_components_are_laid_in_their_object_and_that_in_the_build(
+    tmp_path: Path, item: str, middle_mm: tuple[float, float, float]
+) -> None:
+    solid = read_solid(built(tmp_path / "cube.3mf", item, more=NESTED))
+    assert solid.volume() == pytest.approx(1000.0)
+    box = np.array(solid.bounding_box()).reshape(2, 3)
+    assert box.mean(axis=0) == pytest.approx(middle_mm, abs=1e-9)
 
 
 def test_3mf_of_an_unknown_unit_is_refused(tmp_path: Path) -> None:
