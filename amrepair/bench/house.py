@@ -99,17 +99,15 @@ def _laid(
 ) -> list[Matrix]:
     """Poses of points in the template, the best first; a failed alignment is tried again."""
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
-    for attempt in range(USUAL_HOUSE.retries):
+    for left in reversed(range(USUAL_HOUSE.retries)):
         try:
             found = align(scan, template, part_is_known=True, rng=rng)
+            break
         except AlignmentError as error:
-            if attempt == USUAL_HOUSE.retries - 1:
+            if not left:
                 raise
             _log.info("alignment failed (%s); trying again", error)
-        else:
-            poses = (found.template_from_scan, *found.symmetric_alternatives)
-            return [pose.matrix for pose in poses]
-    raise AlignmentError("no alignment was tried")  # USUAL_HOUSE.retries is at least one
+    return [pose.matrix for pose in (found.template_from_scan, *found.symmetric_alternatives)]
 
 
 def repair_distance(

@@ -48,11 +48,6 @@ class Supervisor:
         os.close(ours)
         self._pipe = theirs
 
-    @property
-    def pid(self) -> int:
-        """Process id of the supervisor."""
-        return self._process.pid
-
     def stand_down(self) -> None:
         """Say farewell: the sender ends in order, nothing is to be done."""
         with contextlib.suppress(OSError):

@@ -30,13 +30,13 @@ class LayerGrid:
 
     Attributes
     ----------
-    explicit_tops_mm
+    tops_mm
         Ascending tops as a job's G-code has them; empty for a regular grid.
     """
 
     first_layer_height_mm: float
     layer_height_mm: float
-    explicit_tops_mm: tuple[float, ...] = ()
+    tops_mm: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not (self.first_layer_height_mm > 0 and self.layer_height_mm > 0):
@@ -44,7 +44,7 @@ class LayerGrid:
                 f"Layer heights must be above 0 mm, not {self.first_layer_height_mm} "
                 f"and {self.layer_height_mm}."
             )
-        if any(b <= a for a, b in zip((0.0, *self.explicit_tops_mm), self.explicit_tops_mm)):  # noqa: B905 - pairs
+        if any(b <= a for a, b in zip((0.0, *self.tops_mm), self.tops_mm)):  # noqa: B905 - pairs
             raise SliceError("The tops of layers must ascend from above 0 mm.")
 
     @classmethod
@@ -58,14 +58,9 @@ class LayerGrid:
         tops = tuple(float(z) for z in tops_mm)
         return cls(tops[0] if tops else layer_height_mm, layer_height_mm, tops)
 
-    @property
-    def tops_mm(self) -> tuple[float, ...]:
-        """The explicit tops."""
-        return self.explicit_tops_mm
-
     def tops_to(self, z_mm: float) -> Float[np.ndarray, " n"]:
         """Tops from the bed up, the last one at or above `z_mm`."""
-        explicit = np.array(self.explicit_tops_mm)
+        explicit = np.array(self.tops_mm)
         last_mm = float(explicit[-1]) if len(explicit) else self.first_layer_height_mm
         count = max(0, math.ceil((z_mm - last_mm - _SAME_LAYER_MM) / self.layer_height_mm))
         if count > MAX_LAYERS:
