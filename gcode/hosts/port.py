@@ -59,10 +59,6 @@ class Capabilities:
                 caps[answer.name] = answer.enabled
         return cls(firmware, caps)
 
-    def has(self, name: str) -> bool:
-        """Whether the firmware says that it can do `name`."""
-        return self.caps.get(name, False)
-
 
 @dataclass(frozen=True, slots=True)
 class PrintReport:

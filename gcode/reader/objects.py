@@ -31,14 +31,11 @@ class JobObjects:
     ----------
     names
         In the order in which they are begun, or defined.
-    marks
-        How the job marks them: `klipper`, `m486`, `comments`, or empty where it does not.
     of_bead
         (n,) index into `names` for the job's beads; -1 for none (skirt, prime tower).
     """
 
     names: tuple[str, ...]
-    marks: str
     of_bead: Int[np.ndarray, " n"]
 
     def own(self, names: Sequence[str]) -> Bool[np.ndarray, " n"]:
@@ -66,14 +63,14 @@ def objects_of(job: Job) -> JobObjects:
     (('lid',), [0, 0, -1])
     """
     lines = job.program.text.split("\n")
-    for marks, read in (("klipper", _klipper), ("m486", _m486), ("comments", _comments)):
+    for read in (_klipper, _m486, _comments):
         names, changes = read(lines)
         if changes:
             at = np.array([line for line, _ in changes])
             which = np.array([NONE, *(index for _, index in changes)])
             found = which[np.searchsorted(at, job.beads.line, side="right")]
-            return JobObjects(tuple(names), marks, found)
-    return JobObjects((), "", np.full(len(job.beads), NONE))
+            return JobObjects(tuple(names), found)
+    return JobObjects((), np.full(len(job.beads), NONE))
 
 
 Changes = list[tuple[int, int]]  # line, and the object from there on

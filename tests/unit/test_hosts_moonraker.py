@@ -168,8 +168,8 @@ def test_questions(fake: FakeMoonraker) -> None:
     with printer_at(fake) as printer:
         assert printer.position_mm() == (1.5, 2.25, 3.0)
         assert printer.capabilities().firmware == "Klipper v0.13"
-        assert printer.capabilities().has("VIRTUAL_SDCARD")
-        assert not printer.capabilities().has("PAUSE_RESUME")
+        assert printer.capabilities().caps["VIRTUAL_SDCARD"]
+        assert not printer.capabilities().caps["PAUSE_RESUME"]
         there = printer.temperatures()
         printer.finish_moves()
     assert (there.hotend_c, there.hotend_target_c, there.bed_c) == (204.8, 205.0, None)

@@ -221,7 +221,7 @@ def test_questions_are_answered_from_the_terminal(fake: FakeOctoPrint) -> None:
     with printer_at(fake) as printer:
         assert printer.position_mm() == (1.5, 2.25, 3.0)
         assert printer.capabilities().firmware == "Marlin 2.1.2"
-        assert printer.capabilities().has("EEPROM")
+        assert printer.capabilities().caps["EEPROM"]
         there = printer.temperatures()
         printer.finish_moves()
     assert (there.hotend_c, there.hotend_target_c, there.bed_c) == (205.4, 205.0, None)

@@ -45,7 +45,6 @@ def job(marks: str, end: str = "\n") -> str:
 def test_each_bead_belongs_to_its_object(marks: str, end: str) -> None:
     read = read_job(job(marks, end))
     found = objects_of(read)
-    assert found.marks == marks
     assert found.names == MARKS[marks][3]
     assert found.of_bead.tolist() == [-1, 0, 0, 1, 1, 0, 0, 1, 1]
     assert box_of_beads_mm(read, found.of_bead == 1) == pytest.approx((20.0, 20.0, 29.0, 29.0))
