@@ -57,7 +57,7 @@ MOST_STRETCH = 0.02  # polypropylene's; more is another scale
 # some slicers reckon with those and some without.
 BEAD_SIDES_RATIO = 0.5 * (1.0 - math.pi / 4.0)
 OFF_LAYERS = 1.5  # walls tell the height to about a layer; a raft has two and more
-UPRIGHT = 1.0 - 1e-5  # of the cosine: a pose of X, Y, Z and a turn about Z has no tilt
+UPRIGHT = math.cos(math.radians(0.5))  # walls of a low part tell its tilt to a third of a degree
 
 
 @dataclass(frozen=True, slots=True)

@@ -331,6 +331,16 @@ def test_a_first_layer_over_a_gap_is_pressed_down_by_the_next() -> None:
     assert foot_mm(job) == pytest.approx(0.73)
 
 
+@pytest.mark.parametrize(("tilt_deg", "upright"), [(0.33, True), (1.0, False), (90.0, False)])
+def test_a_tilt_that_walls_do_not_tell_is_none(tilt_deg: float, upright: bool) -> None:
+    """regression: a panel clip, 6 mm low and drawn at Z −126 mm, was cut 0.7 mm aside."""
+    tilted = rotation_from_vector(np.deg2rad([tilt_deg, 0.0, 0.0]))
+    placed = Transform.from_rotation_translation(
+        "build", "template", rotation=tilted, translation_mm=np.array([107.5, 122.5, 126.0])
+    )
+    assert is_upright(placed) == upright
+
+
 @pytest.mark.parametrize("moved_mm", [-0.15, -0.1, 0.0, 0.1, 0.15])
 def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
     """regression: 'XY size compensation' of 0.1 mm made it another part, or one that lacks it."""
