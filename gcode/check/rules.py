@@ -287,7 +287,10 @@ class Judge(Motion):
         printer, pushed = self._setup.printer, self.moves.sums.pushed
         before = self._tool or ("T0" if pushed or printer.heads > 1 else tool)
         if tool != before and not printer.one_nozzle and (pushed or printer.heads == 1):
-            self._refuse("change of tool or filament", tool, f"{before}, as it began")
+            limit = f"{before}, as it began"
+            if printer.heads == 1:
+                limit += "; where filaments change, the profile's 'heads' and 'one_nozzle' say so"
+            self._refuse("change of tool or filament", tool, limit)
             self._tool = before
             return
         if printer.docks:

@@ -214,9 +214,9 @@ class PrinterProfile(_Profile):
     reach_max_mm: Xy | None = None  # itself where left out
     off_bed_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # a user's job may, where nobody knows
     nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=10.0)]  # pellets' are wide
-    heads: Annotated[int, Field(ge=1, le=64)] = 1  # that T0, T1, … choose; a job uses one
+    heads: Annotated[int, Field(ge=1, le=64)] = 1  # that T0, T1, … choose; a job uses one,
     tool: Annotated[int, Field(ge=0, lt=64)] = 0  # of them, that programs of ours take
-    one_nozzle: bool = False  # and what they choose are filaments
+    one_nozzle: bool = False  # or they are filaments, which it may change
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
     max_acceleration_mm_s2: AxisLimits
