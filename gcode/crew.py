@@ -33,10 +33,21 @@ def forks() -> int:
     return cores() if sys.platform == "linux" else 1
 
 
-def in_order(ask: Callable[[int], R], count: int, *, workers: int) -> Iterator[R]:
+def nothing() -> None:
+    """What there is to do meanwhile, where nobody says what."""
+
+
+def in_order(
+    ask: Callable[[int], R],
+    count: int,
+    *,
+    workers: int,
+    meanwhile: Callable[[], object] = nothing,
+) -> Iterator[R]:
     """`ask(0)` to `ask(count - 1)`, worked out by so many processes at once.
 
-    The first is worked out here: what is loaded for it is then there for all of them.
+    The first is worked out here: what is loaded for it is then there for all of them. What is to be
+    done `meanwhile` this process does once the others are at work; not at all where it is alone.
 
     Raises
     ------
@@ -62,6 +73,7 @@ def in_order(ask: Callable[[int], R], count: int, *, workers: int) -> Iterator[R
             pool.submit(_piece, start, min(start + size, count)) for start in range(1, count, size)
         )
         gc.unfreeze()
+        meanwhile()
         while pieces:
             yield from pieces.popleft().result()
     except BrokenProcessPool as error:

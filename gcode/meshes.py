@@ -58,10 +58,15 @@ class ClosedMesh:
         volumes, boxes = self._bodies
         return [tuple(box) for box in boxes[volumes > 0].tolist()]
 
-    def bounding_box(self) -> tuple[float, ...]:
-        """(x_min, y_min, z_min, x_max, y_max, z_max)."""
+    @cached_property
+    def _box(self) -> tuple[float, ...]:
+        """Asked for again and again, too."""
         low, high = self.vertices_mm.min(axis=0), self.vertices_mm.max(axis=0)
         return tuple(float(v) for v in (*low, *high))
+
+    def bounding_box(self) -> tuple[float, ...]:
+        """(x_min, y_min, z_min, x_max, y_max, z_max)."""
+        return self._box
 
     def translate(self, by_mm: tuple[float, float, float]) -> ClosedMesh:
         """The same mesh elsewhere."""

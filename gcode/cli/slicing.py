@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,7 +23,7 @@ from gcode.cli.options import (
     standing_on_bed,
 )
 from gcode.errors import InputError
-from gcode.process import gives_back
+from gcode.process import collector_held, gives_back
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
 
 if TYPE_CHECKING:
@@ -62,21 +64,21 @@ def slice_solid(
     as_json: JsonOption = False,
 ) -> None:
     """Slice a solid: a whole job, or with --as-built a patch on top of what stands there."""
-    from gcode.check import check as check_program
-    from gcode.estimate import estimate as estimate_program
     from gcode.profiles import load_setup
-    from gcode.profiles.own_settings import profiles_line
 
-    title = f"{solid.name}\n{profiles_line((printer, material, process))}"
     place = _place(place, patch=as_built is not None)
     console.writable(output)
-    setup = load_setup(printer, material, process)
+    profiles = printer, material, process
+    setup = load_setup(*profiles)
     bars = console.Bars()
-    with bars.shown():
+    with bars.shown(), collector_held():
         if as_built is None:
-            made = _whole(solid, setup, title, place, workers, bars)
+            made = _whole(solid, setup, profiles, place, workers, bars)
         else:
-            made = _patch(solid, setup, title, place, (as_built, job), bars)
+            made = _patch(solid, setup, profiles, place, (as_built, job), bars)
+        from gcode.check import check as check_program
+        from gcode.estimate import estimate as estimate_program
+
         program = made.program
         gives_back(check_program)(program, setup, as_built=made.field, progress=bars)
         cost = gives_back(estimate_program)(program, setup.printer, progress=bars)
@@ -124,7 +126,7 @@ class _Made:
 def _whole(
     solid: Path,
     setup: PrintSetup,
-    title: str,
+    profiles: tuple[str, str, str],
     place: str,
     workers: int | None,
     bars: console.Bars,
@@ -136,18 +138,20 @@ def _whole(
 
     with bars.stage("read solid"):
         shape, moved_mm = _placed(gives_back(read_closed)(solid), setup, place)
-    toolpath = gives_back(slice_part)(shape, setup, workers=workers or forks(), progress=bars)
+    toolpath = gives_back(slice_part)(
+        shape, setup, workers=workers or forks(), progress=bars, meanwhile=_load_what_judges
+    )
     where = _where(shape, moved_mm) if place == CENTRE else None
     solid_mm3 = float(shape.volume())
     del shape  # half of what is held
-    program = gives_back(_written)(toolpath, setup, title, (), bars)
+    program = gives_back(_written)(toolpath, setup, _title(solid, profiles), (), bars)
     return _Made(program, toolpath.volume_mm3, solid_mm3, moved_mm, where)
 
 
 def _patch(
     solid: Path,
     setup: PrintSetup,
-    title: str,
+    profiles: tuple[str, str, str],
     place: str,
     around: tuple[Path, Path | None],
     bars: console.Bars,
@@ -162,9 +166,26 @@ def _patch(
     grid = grid_of(None if around[1] is None else job_of(around[1], setup), setup)
     plan = slice_patch(shape, setup, as_built=field, grid=grid, standalone=True, progress=bars)
     left = (*plan.unreachable, *plan.unprintable)
-    program = _written(plan.toolpath, setup, title, left, bars)
+    program = _written(plan.toolpath, setup, _title(solid, profiles), left, bars)
     volumes = plan.toolpath.volume_mm3, float(shape.volume())
     return _Made(program, *volumes, moved_mm, None, field, left, plan.first_pass)
+
+
+def _load_what_judges() -> None:
+    """What a program is written and judged by, while others plan it.
+
+    What is loaded stays: as Python ends, it would look twice through all of it for circles that
+    nobody needs any more, for 0.3 s.
+    """
+    for room in ("check", "estimate", "profiles.own_settings", "writer"):
+        import_module(f"gcode.{room}")
+    gc.freeze()
+
+
+def _title(solid: Path, profiles: tuple[str, str, str]) -> str:
+    from gcode.profiles.own_settings import profiles_line
+
+    return f"{solid.name}\n{profiles_line(profiles)}"
 
 
 def _written(

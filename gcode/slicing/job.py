@@ -8,13 +8,14 @@ thin for a bead is listed with its volume. Supports are not made.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from gcode.crew import in_order
+from gcode.crew import in_order, nothing
 from gcode.errors import SliceError
 from gcode.meshes import Cuts, closed_mesh
 from gcode.moves import Comment, LayerChange, Role, Script, SetFan, SetHotend, Toolpath
@@ -47,6 +48,7 @@ def slice_part(
     options: PartOptions = USUAL_PART,
     workers: int = 1,
     progress: Progress = silent,
+    meanwhile: Callable[[], object] = nothing,
 ) -> Toolpath:
     """Slice a solid (`Manifold` or `ClosedMesh`, build frame) into a whole job; see `plan_part`.
 
@@ -59,7 +61,9 @@ def slice_part(
     >>> 0.97 < toolpath.volume_mm3 / solid.volume() < 1.03
     True
     """
-    plan = plan_part(solid, setup, options=options, workers=workers, progress=progress)
+    plan = plan_part(
+        solid, setup, options=options, workers=workers, progress=progress, meanwhile=meanwhile
+    )
     return plan.toolpath
 
 
@@ -70,6 +74,7 @@ def plan_part(
     options: PartOptions = USUAL_PART,
     workers: int = 1,
     progress: Progress = silent,
+    meanwhile: Callable[[], object] = nothing,
 ) -> PartPlan:
     """Slice a solid into a whole job, and say what could not be made.
 
@@ -82,6 +87,8 @@ def plan_part(
     workers
         Processes that plan layers at once, forked from this one: 1 where it has other threads. What
         they plan does not depend on how many they are.
+    meanwhile
+        Done here while they are at work: what will be needed next can be loaded.
 
     Raises
     ------
@@ -104,7 +111,7 @@ def plan_part(
     _begin(pen, setup, float(solid.bounding_box()[5]))
     seam_mm = np.array([-1e3, 1e3])
     labels = Labels(boxes_apart_mm(solid, setup.process.line_width_mm))
-    plans = in_order(layers.plan, len(slabs), workers=workers)
+    plans = in_order(layers.plan, len(slabs), workers=workers, meanwhile=meanwhile)
     for slab, plan in zip(slabs, plans, strict=True):
         lost += plan.lost
         _change_layer(pen, slab, setup)
@@ -151,18 +158,24 @@ def _box_text(box: tuple[float, ...]) -> str:
 
 
 def _merged(lost: list[Unprintable]) -> tuple[Unprintable, ...]:
-    """The same place in consecutive layers is one thing."""
+    """The same place in consecutive layers is one thing; they come from the lowest layer up."""
     out: list[Unprintable] = []
+    open_mm, going_on = -math.inf, list[int]()  # what ends at this layer's foot, or in it
     for thing in lost:
-        for k in range(len(out) - 1, -1, -1):
-            a, b = out[k].box_mm, thing.box_mm
+        b = thing.box_mm
+        if b[2] > open_mm:
+            open_mm = b[2]
+            going_on = [k for k in going_on if out[k].box_mm[5] > open_mm - 1e-6]
+        for k in reversed(going_on):
+            a = out[k].box_mm
             touches = a[0] <= b[3] and b[0] <= a[3] and a[1] <= b[4] and b[1] <= a[4]
             if touches and abs(a[5] - b[2]) < 1e-6 and out[k].reason == thing.reason:
-                low, high = np.minimum(a[:3], b[:3]), np.maximum(a[3:], b[3:])
-                box = tuple(float(v) for v in (*low, *high))
-                out[k] = Unprintable(out[k].volume_mm3 + thing.volume_mm3, box, thing.reason)  # type: ignore[arg-type]
+                low, high = map(min, a[:3], b[:3]), map(max, a[3:], b[3:])
+                box: Any = (*low, *high)
+                out[k] = Unprintable(out[k].volume_mm3 + thing.volume_mm3, box, thing.reason)
                 break
         else:
+            going_on.append(len(out))
             out.append(thing)
     return tuple(out)
 

@@ -12,6 +12,7 @@ import numpy as np
 from gcode.compiled import njit
 from gcode.slicing.delaunay_kernels import triangles
 from gcode.slicing.infill_kernels import inside
+from gcode.slicing.order_kernels import area_along
 
 LEAF_RATIO = 1.2  # of a junction's radius: a shorter branch to a wall is its corner, not an axis
 NO_CENTRE_MM = 1e9  # where a triangle without area has its centre
@@ -246,3 +247,146 @@ def apart_by(points: Any, least: float) -> Any:
             last = k
     keep[0] = keep[-1] = True
     return keep
+
+
+@njit(cache=True, nogil=True)
+def ends_meet(runs: Any, begins: Any, nodes: int) -> bool:
+    """Whether an end of one run, of those that do not end where they begin, is another one's."""
+    at = np.full(nodes, -1, np.int64)
+    for run in range(len(begins) - 1):
+        head, tail = runs[begins[run]], runs[begins[run + 1] - 1]
+        if head == tail:
+            continue
+        for end in (head, tail):
+            if at[end] >= 0 and at[end] != run:
+                return True
+            at[end] = run
+    return False
+
+
+@njit(cache=True, nogil=True)
+def wide_enough(along: Any, radius: Any, least: float) -> Any:
+    """Where a wall along a chain is thick enough, and where it is taken for it.
+
+    A wall that is thinner for less than such a length breaks no bead, and one that is thick enough
+    for less holds none: a wall of just that thickness would be a row of dashes.
+    """
+    n = len(along)
+    wide = np.empty(n, np.bool_)
+    for i in range(n):
+        wide[i] = 2 * radius[i] >= least * (1 - 1e-6)
+    for holds in (False, True):  # short gaps are closed before short stretches go
+        end = 0
+        while end < n:
+            first = end
+            while end < n and wide[end] == holds:
+                end += 1
+            if end == first:
+                end += 1
+            elif along[end - 1] - along[first] < least and (holds or (first > 0 and end < n)):
+                wide[first:end] = not holds
+    return wide
+
+
+@njit(cache=True, nogil=True)
+def put_bead(
+    points: Any, radius: Any, most: float, inset: float, apart: float, xy: Any, share: Any
+) -> tuple[int, bool]:
+    """A smooth bead along a chain, its open ends drawn out to a part of a radius from the wall.
+
+    Its points and shares go to the beginning of `xy` and `share`; returns how many points it has,
+    and whether it is closed.
+    """
+    n = len(points)
+    closed = (
+        n > 3
+        and abs(points[0, 0] - points[n - 1, 0]) < 1e-9
+        and abs(points[0, 1] - points[n - 1, 1]) < 1e-9
+    )
+    line, width = points, radius
+    if not closed:
+        line, width = np.empty((n + 2, 2)), np.empty(n + 2)
+        line[1 : n + 1], width[1 : n + 1] = points, radius
+        for end, inner, out in ((0, min(2, n - 1), 0), (n - 1, n - min(3, n), n + 1)):
+            x, y = points[end, 0] - points[inner, 0], points[end, 1] - points[inner, 1]
+            long = max(np.hypot(x, y), 1e-12)
+            line[out, 0] = points[end, 0] + x / long * inset * radius[end]
+            line[out, 1] = points[end, 1] + y / long * inset * radius[end]
+            width[out] = radius[end]
+    keep = apart_by(line, apart)
+    count, before = 0, 0.0
+    for k in range(len(line)):
+        if not keep[k]:
+            continue
+        xy[count, 0], xy[count, 1] = line[k, 0], line[k, 1]
+        if count > 0:
+            share[count - 1] = min(before + width[k], most)
+        before = width[k]
+        count += 1
+    return count, closed
+
+
+@njit(cache=True, nogil=True)
+def beads_along(
+    nodes: Any,
+    radius: Any,
+    runs: Any,
+    begins: Any,
+    least: float,
+    most: float,
+    inset: float,
+    apart: float,
+) -> tuple[Any, Any, Any, Any, float]:
+    """Beads along chains of nodes, wherever these are far enough from the walls.
+
+    Parameters
+    ----------
+    nodes, radius
+        (n, 2) places and (n,) distances to the walls.
+    runs, begins
+        The chains' nodes one after the other, and where each chain begins (with the end).
+    least, most
+        Widths of a bead.
+    inset
+        Of the radius: so far from its wall an open bead ends.
+    apart
+        Of a bead's points.
+
+    Returns
+    -------
+    tuple
+        (p, 2) points of all beads, (p,) the share of the piece from each point on (none from a
+        bead's last one), (b + 1,) where each bead begins (with the end), (b,) whether it is closed,
+        and the area that all of them stand for.
+    """
+    most_points = 2 * len(runs)  # of two nodes at least an open bead has two points more
+    xy, share = np.empty((most_points, 2)), np.zeros(most_points)
+    first, closed = np.zeros(len(runs) + 1, np.int64), np.zeros(len(runs), np.bool_)
+    beads, area = 0, 0.0
+    for run in range(len(begins) - 1):
+        chain = runs[begins[run] : begins[run + 1]]
+        n = len(chain)
+        points, to_wall, along = np.empty((n, 2)), np.empty(n), np.zeros(n)
+        for k in range(n):
+            points[k, 0], points[k, 1] = nodes[chain[k], 0], nodes[chain[k], 1]
+            to_wall[k] = radius[chain[k]]
+            if k > 0:
+                step = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+                along[k] = along[k - 1] + step
+        wide = wide_enough(along, to_wall, least)
+        a = 0
+        while a < n:
+            b = a
+            while b < n and wide[b]:
+                b += 1
+            if b - a >= 2:
+                at = first[beads]
+                put, closed[beads] = put_bead(
+                    points[a:b], to_wall[a:b], most, inset, apart, xy[at:], share[at:]
+                )
+                area += area_along(xy[at : at + put], share[at : at + put - 1])
+                beads += 1
+                first[beads] = at + put
+            a = b + 1
+    end = first[beads]
+    return xy[:end], share[:end], first[: beads + 1], closed[:beads], area

@@ -7,6 +7,7 @@ Regions are `manifold3d.CrossSection` (Clipper2 underneath: 500 offsets of real 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -35,9 +36,8 @@ def flattened(region: Any) -> tuple[Float[np.ndarray, "n 2"], Int[np.ndarray, " 
     contours = region.to_polygons()
     if not contours:
         return np.zeros((0, 2)), np.zeros(1, np.int64)
-    points = np.concatenate(contours).astype(np.float64)
-    starts = np.cumsum([0, *[len(c) for c in contours]])
-    return points, starts.astype(np.int64)
+    points = np.concatenate(contours, dtype=np.float64)
+    return points, np.array([0, *accumulate(map(len, contours))], np.int64)
 
 
 def union(regions: list[Any]) -> Any:
