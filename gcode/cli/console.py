@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import logging
 import os
@@ -61,6 +62,7 @@ out = _Told(highlight=False, soft_wrap=True, markup=False)
 Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
+_circles_left: list[bool] = []
 
 
 class _TimeLeft(TimeRemainingColumn):
@@ -291,7 +293,19 @@ def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     for library in ("trimesh", "tifffile"):  # they log tracebacks; what is wrong we tell once
         logging.getLogger(library).setLevel(logging.CRITICAL)
-    sys.exit(_exit_code(app, name, known))  # no error is alive any more, nor what it held
+    code = _exit_code(app, name, known)
+    if _circles_left:
+        gc.freeze()
+    sys.exit(code)  # no error is alive any more, nor what it held
+
+
+def leave_circles() -> None:
+    """Have Python end without a look for objects that hold each other.
+
+    It would look twice through all that is loaded, for 0.3 s after a command has done its work.
+    What holds memory of C++ libraries must be in no such circle: they would complain.
+    """
+    _circles_left.append(True)
 
 
 def _exit_code(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> int:

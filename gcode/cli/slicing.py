@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -102,6 +101,7 @@ def slice_solid(
         console.show_json(result)
     else:
         _tell(result, made.where)
+    console.leave_circles()
 
 
 @dataclass(frozen=True)
@@ -172,14 +172,9 @@ def _patch(
 
 
 def _load_what_judges() -> None:
-    """What a program is written and judged by, while others plan it.
-
-    What is loaded stays: as Python ends, it would look twice through all of it for circles that
-    nobody needs any more, for 0.3 s.
-    """
+    """What a program is written and judged by, while others plan it."""
     for room in ("check", "estimate", "profiles.own_settings", "writer"):
         import_module(f"gcode.{room}")
-    gc.freeze()
 
 
 def _title(solid: Path, profiles: tuple[str, str, str]) -> str:
