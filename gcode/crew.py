@@ -63,10 +63,10 @@ def in_order(
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
-    size = max(1, -(-count // (workers * PIECES)))
+    size, told = max(1, -(-count // (workers * PIECES))), [ask]
     gc.freeze()  # what is there already is not looked through, and so not copied, by the children
     pool = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("fork"), initializer=_begin, initargs=(ask,)
+        workers, multiprocessing.get_context("fork"), initializer=_begin, initargs=(told,)
     )
     try:
         pieces = deque(
@@ -83,12 +83,13 @@ def in_order(
         ) from error
     finally:
         pool.shutdown(cancel_futures=True)
+        told.clear()  # a pool may outlive its use, and with it all that was asked about
 
 
-def _begin(ask: Callable[[int], Any]) -> None:
+def _begin(told: list[Callable[[int], Any]]) -> None:
     """In a worker: what it will be asked; the parent alone hears of Ctrl-C."""
     global _asked  # noqa: PLW0603 - one process, one task
-    _asked = ask
+    _asked = told[0]
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
 

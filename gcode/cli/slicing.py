@@ -63,6 +63,7 @@ def slice_solid(
     as_json: JsonOption = False,
 ) -> None:
     """Slice a solid: a whole job, or with --as-built a patch on top of what stands there."""
+    from gcode.compiled import all_from_disk
     from gcode.profiles import load_setup
 
     place = _place(place, patch=as_built is not None)
@@ -101,7 +102,8 @@ def slice_solid(
         console.show_json(result)
     else:
         _tell(result, made.where)
-    console.leave_circles()
+    if all_from_disk():  # numba's circles hold whatever called a kernel when it was compiled
+        console.leave_circles()
 
 
 @dataclass(frozen=True)

@@ -123,19 +123,68 @@ def chain_chords(low: Any, high: Any, first: Any, reach: float) -> tuple[Any, An
 
 
 @njit(cache=True, nogil=True)
-def inside(x: Any, y: Any, points: Any, starts: Any) -> Any:
-    """Whether points (x, y) lie inside the polygons (even-odd)."""
-    out = np.zeros(x.shape[0], np.bool_)
-    for i in range(x.shape[0]):
-        odd = False
+def edges_by_row(points: Any, starts: Any, low: float, high: float) -> tuple[Any, Any, float]:
+    """Edges of polygons by the rows that they reach into, and how many rows there are in a unit.
+
+    Rows are as high as an edge is on average: three times as many entries as edges, at most.
+
+    Returns
+    -------
+    tuple
+        (r + 1,) where each row's edges start (with the end), (e, 2) their ends among the points,
+        and rows a unit, from `low` up.
+    """
+    n = points.shape[0]
+    climbed = 0.0
+    for c in range(starts.shape[0] - 1):
+        k = starts[c + 1] - 1
+        for j in range(starts[c], starts[c + 1]):
+            climbed += abs(points[j, 1] - points[k, 1])
+            k = j
+    rows = max(1, int((high - low) * n / climbed))
+    a_unit = rows / (high - low)
+    first = np.zeros(rows + 2, np.int64)
+    edges = np.empty((0, 2), np.int64)
+    for turn in range(2):
+        if turn == 1:
+            for r in range(rows):
+                first[r + 2] += first[r + 1]
+            edges = np.empty((first[rows + 1], 2), np.int64)
         for c in range(starts.shape[0] - 1):
             k = starts[c + 1] - 1
             for j in range(starts[c], starts[c + 1]):
-                if (points[j, 1] > y[i]) != (points[k, 1] > y[i]) and x[i] < (
-                    points[k, 0] - points[j, 0]
-                ) * (y[i] - points[j, 1]) / (points[k, 1] - points[j, 1]) + points[j, 0]:
-                    odd = not odd
+                foot, top = min(points[j, 1], points[k, 1]), max(points[j, 1], points[k, 1])
+                begin = min(int((foot - low) * a_unit), rows - 1)
+                end = min(int((top - low) * a_unit), rows - 1)
+                for r in range(begin, end + 1):
+                    if turn == 0:
+                        first[r + 2] += 1
+                    else:
+                        edges[first[r + 1], 0], edges[first[r + 1], 1] = j, k
+                        first[r + 1] += 1
                 k = j
+    return first[: rows + 1], edges, a_unit
+
+
+@njit(cache=True, nogil=True)
+def inside(x: Any, y: Any, points: Any, starts: Any) -> Any:
+    """Whether points (x, y) lie inside the polygons (even-odd)."""
+    out = np.zeros(x.shape[0], np.bool_)
+    low, high = points[:, 1].min(), points[:, 1].max()
+    if low == high:
+        return out
+    first, edges, a_unit = edges_by_row(points, starts, low, high)
+    for i in range(x.shape[0]):
+        if not low <= y[i] < high:
+            continue
+        odd = False
+        row = min(int((y[i] - low) * a_unit), len(first) - 2)
+        for e in range(first[row], first[row + 1]):
+            j, k = edges[e]
+            if (points[j, 1] > y[i]) != (points[k, 1] > y[i]) and x[i] < (
+                points[k, 0] - points[j, 0]
+            ) * (y[i] - points[j, 1]) / (points[k, 1] - points[j, 1]) + points[j, 0]:
+                odd = not odd
         out[i] = odd
     return out
 
