@@ -22,6 +22,7 @@ from gcode.surfaces.lines import near_lines
 
 SAME_LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
 ON_MM = 0.05  # of a line's middle
+BOX_MM = 1.5 * ON_MM  # about a stretch: nothing outside lies on it, however sums are rounded
 EXACTLY_MM = 0.01  # how exactly it is told which columns lie in a line
 
 
@@ -295,11 +296,27 @@ def runs_of(
     gone = np.zeros(len(section_mm2), dtype=bool)
     if runs and len(lines.gone_mm):
         high_mm = float(lines.end_mm[0, 2])
-        for a, b in lines.gone_mm[np.abs(lines.gone_mm[:, 0, 2] - high_mm) < SAME_LEVEL_MM]:
-            gone |= _on(middles, a[:2], b[:2])
+        level = np.abs(lines.gone_mm[:, 0, 2] - high_mm) < SAME_LEVEL_MM
+        gone = _on_any(middles, lines.gone_mm[level, :, :2])
     height_mm = float(np.median(lines.height_mm)) if runs else 0.0
     half_mm = 0.5 * float(np.median(section_mm2)) / height_mm if runs else 0.0
     return runs, JobPieces(section_mm2, height_mm, half_mm, gone, over)
+
+
+def _on_any(
+    points_mm: Float[np.ndarray, "p 2"], stretches_mm: Float[np.ndarray, "g 2 2"]
+) -> Bool[np.ndarray, " p"]:
+    """Which points lie on any of some stretches; each asks those in its box alone."""
+    found = np.zeros(len(points_mm), dtype=bool)
+    order = np.argsort(points_mm[:, 0])
+    x_mm, y_mm = points_mm[order].T
+    low, high = stretches_mm.min(axis=1) - BOX_MM, stretches_mm.max(axis=1) + BOX_MM
+    first, last = np.searchsorted(x_mm, low[:, 0]), np.searchsorted(x_mm, high[:, 0], side="right")
+    for k, (a_mm, b_mm) in enumerate(stretches_mm):
+        beside = slice(first[k], last[k])
+        near = order[beside][(y_mm[beside] >= low[k, 1]) & (y_mm[beside] <= high[k, 1])]
+        found[near] |= _on(points_mm[near], a_mm, b_mm)
+    return found
 
 
 def _on(
