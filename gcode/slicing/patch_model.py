@@ -82,7 +82,7 @@ class PatchModel:
         self.reach = self.reach_of(as_built)
         self._tip_cells = self.reach.cells_of(self.points_mm)
 
-    def reach_of(self, field: HeightField) -> Reach:
+    def reach_of(self, field: HeightField, before: Reach | None = None) -> Reach:
         """Where the nozzle may be over what stands there, around the patch."""
         # the lowest pass lies at most one thick bead above the deficit's floor
         lowest_mm = max(0.0, float(self.box[2]))
@@ -92,6 +92,7 @@ class PatchModel:
             lowest_tip_mm=lowest_mm,
             window_mm=self._window_mm,
             finer=self.options.columns.tip_cells,
+            before=before,
         )
 
     def _centres(self) -> Float[np.ndarray, "n 2"]:

@@ -59,14 +59,14 @@ def stages_of(
             at -= 1
         groups[at:] = [set().union({region}, *groups[at:])]
         laid = [chain for done in set().union(*groups) for _, chain in regions[done]]
-        fields[at + 1 :] = [_reach_over(laid, model, setup)]
+        fields[at + 1 :] = [_reach_over(laid, model, setup, fields[at])]
     return [
         Stage(_of_regions(passes, group, regions, reach), reach)
         for group, reach in zip(groups, fields[:-1], strict=True)
     ]
 
 
-def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reach:
+def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup, before: Reach) -> Reach:
     """Where the nozzle may be once beads are laid, as the checker will have them stand."""
     start, end = (
         np.concatenate([np.column_stack([c.xy_mm, c.z_mm])[cut] for c in laid])
@@ -74,7 +74,7 @@ def _reach_over(laid: list[Chain], model: PatchModel, setup: PrintSetup) -> Reac
     )
     section_mm2 = np.concatenate([chain.section_mm2 for chain in laid])
     bore_mm = setup.printer.nozzle_diameter_mm
-    return model.reach_of(with_beads(model.as_built, start, end, section_mm2, bore_mm))
+    return model.reach_of(with_beads(model.as_built, start, end, section_mm2, bore_mm), before)
 
 
 def _regions(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:

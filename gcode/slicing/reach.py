@@ -74,10 +74,8 @@ def _cut(
     more = math.ceil(around_mm / field.cell_mm) + 3
     first = [max(w.start - more, 0) for w in window]
     rows, columns = (slice(a, w.stop + more) for a, w in zip(first, window, strict=True))
-    z_mm, seen = (
-        v[rows, columns].repeat(finer, axis=0).repeat(finer, axis=1)
-        for v in (field.z_mm, field.seen)
-    )
+    z_mm = field.z_mm[rows, columns].repeat(finer, axis=1).repeat(finer, axis=0)
+    seen = np.ones(z_mm.shape, dtype=bool)  # nobody asks
     origin_mm = field.origin_mm + np.array(first[::-1]) * field.cell_mm
     y, x = (
         slice(finer * (w.start - a), finer * (w.stop - a))
@@ -100,6 +98,9 @@ class Reach:
     finer
         Cells of the tip in one of the field, each way: the smaller they are, the less is lost to
         not knowing where in its cell the tip is.
+    before
+        The same over the same grid, when other things stood there: only around what has changed
+        since is asked again.
     """
 
     def __init__(
@@ -110,19 +111,53 @@ class Reach:
         lowest_tip_mm: float = 0.0,
         window_mm: tuple[float, float, float, float] | None = None,
         finer: int = 1,
+        before: Reach | None = None,
     ) -> None:
         window = field.window(window_mm or field.box_mm)
+        self._whole = field
         self._top_mm = field.top_mm
         # A slice that stays above everything when the tip is lowest cannot touch anything.
         high_mm = field.top_mm - lowest_tip_mm
         self.obstacles = tuple(
-            Obstacle(part, least_tip(part, field, window, finer))
+            Obstacle(part, self._least_tip(part, window, finer, before))
             for part in printer.head
             if part.z_from_mm <= high_mm
         )
         self.field = field.crop(window_mm or field.box_mm)
         self.cell_mm = field.cell_mm / finer
         self.shape = (finer * self.field.shape[0], finer * self.field.shape[1])
+
+    def _least_tip(
+        self,
+        part: EnvelopeSlice,
+        window: tuple[slice, slice],
+        finer: int,
+        before: Reach | None,
+    ) -> Float[np.ndarray, "ny nx"]:
+        """`least_tip`; of a slice that is no cone, from what was so before where nothing changed.
+
+        A cone's sweep hands on from cell to cell: what changes may count anywhere.
+        """
+        known = [o for o in before.obstacles if o.part == part] if before is not None else []
+        if before is None or not known or part.widening_mm > 0:
+            return least_tip(part, self._whole, window, finer)
+        more = math.ceil(part.reach_mm / self._whole.cell_mm) + 3
+        first = [max(w.start - more, 0) for w in window]
+        near = tuple(slice(a, w.stop + more) for a, w in zip(first, window, strict=True))
+        changed = self._whole.z_mm[near] != before._whole.z_mm[near]
+        if not changed.any():
+            return known[0].least_tip_mm
+        around = []
+        for axis, (a, w) in enumerate(zip(first, window, strict=True)):
+            at = a + np.flatnonzero(changed.any(axis=1 - axis))
+            around.append(slice(max(at[0] - more, w.start), min(at[-1] + 1 + more, w.stop)))
+        least = known[0].least_tip_mm.copy()
+        rows, columns = (
+            slice(finer * (a.start - w.start), finer * (a.stop - w.start))
+            for a, w in zip(around, window, strict=True)
+        )
+        least[rows, columns] = least_tip(part, self._whole, (around[0], around[1]), finer)
+        return least
 
     def least_over(self, way_mm: Float[np.ndarray, "n 2"]) -> float:
         """How high the tip must at least be to go along points; where unknown, over everything."""

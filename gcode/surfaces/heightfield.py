@@ -177,7 +177,7 @@ class HeightField:
         box = len(dy) > 0 and (low == low[0]).all() and (high == high[0]).all()
         if not box:
             return kernels.dilate_rows(
-                self.z_mm.astype(np.float64), dy, low, high,
+                read_only(self.z_mm, np.float64), dy, low, high,
                 rows.start, rows.stop, columns.start, columns.stop,
             )  # fmt: skip
         wide = _greatest_of_next(

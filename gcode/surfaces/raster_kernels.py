@@ -131,24 +131,21 @@ def dilate_rows(
             spans[iy, ix] = z[iy + top, ix + left]
     long, longest = 1, (row_high - row_low).max() + 1
     while long <= longest:
-        for r in range(row_dy.shape[0]):
-            wide = row_high[r] - row_low[r] + 1
-            if wide < long or wide >= 2 * long:
-                continue
-            one = x0 + row_low[r] - left
-            other = one + wide - long
-            for iy in range(y1 - y0):
-                source = spans[iy + y0 + row_dy[r] - top]
-                into = out[iy]
+        for iy in range(y1 - y0):  # a row of the answer stays in the cache while it is made
+            into = out[iy]
+            for r in range(row_dy.shape[0]):
+                wide = row_high[r] - row_low[r] + 1
+                if wide < long or wide >= 2 * long:
+                    continue
+                source = spans[iy + y0 + row_dy[r] - top, x0 + row_low[r] - left :]
+                other = source[wide - long :]
                 for ix in range(x1 - x0):
-                    a, b = source[ix + one], source[ix + other]
-                    a = a if a > b else b
+                    a = source[ix] if source[ix] > other[ix] else other[ix]
                     into[ix] = a if a > into[ix] else into[ix]
         for iy in range(height):
-            row = spans[iy]
+            row, other = spans[iy], spans[iy, long:]
             for ix in range(width - long):
-                a, b = row[ix], row[ix + long]
-                row[ix] = a if a > b else b
+                row[ix] = row[ix] if row[ix] > other[ix] else other[ix]
         long *= 2
     return out
 
@@ -229,7 +226,7 @@ def less_with_distance(z: Any, rise: float, within: float) -> Any:
     then be too low, yet no lower than the greatest of all cells there less `rise × (within - √2)`.
     """
     ny, nx = z.shape
-    out = z.copy()
+    out, won = z.copy(), z.copy()  # what wins here, less its distance, and before
     from_y = np.empty((ny, nx), np.int32)
     from_x = np.empty((ny, nx), np.int32)
     for iy in range(ny):
@@ -250,16 +247,17 @@ def less_with_distance(z: Any, rise: float, within: float) -> Any:
                         jx = back if k == 3 else ix + k - 1
                         if jy < 0 or jy >= ny or jx < 0 or jx >= nx:
                             continue
-                        sy, sx = from_y[jy, jx], from_x[jy, jx]
-                        most = z[sy, sx]
+                        most = won[jy, jx]
                         if most <= out[iy, ix]:
                             continue
+                        sy, sx = from_y[jy, jx], from_x[jy, jx]
                         far = np.sqrt(float((sy - iy) ** 2 + (sx - ix) ** 2))
                         if far > within:
                             continue
                         value = most - rise * far
                         if value > out[iy, ix]:
                             out[iy, ix] = value
+                            won[iy, ix] = most
                             from_y[iy, ix] = sy
                             from_x[iy, ix] = sx
     return out

@@ -105,6 +105,26 @@ def test_beside_a_wall_the_cone_goes_as_deep_as_meant_and_a_cell_deeper_at_most(
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
+def test_what_was_known_before_changes_no_answer(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    printer = load_setup(printer="prusa_mk3s").printer
+    z_mm = rng.uniform(0.0, 3.0, (70, 90)).round(1)
+    field = HeightField(np.zeros(2), 0.2, z_mm, np.ones(z_mm.shape, dtype=bool))
+    (y0, y1), (x0, x1) = (np.sort(rng.integers(0, n + 1, 2)) for n in z_mm.shape)
+    z_mm = z_mm.copy()
+    z_mm[y0:y1, x0:x1] = rng.uniform(0.0, 30.0)  # above slices that were passed over, too
+    window = (3.0, 3.0, 9.0, 7.0)
+    before = Reach(field, printer, window_mm=window, finer=2)
+    later = HeightField(field.origin_mm, field.cell_mm, z_mm, field.seen)
+    found = Reach(later, printer, window_mm=window, finer=2, before=before)
+    anew = Reach(later, printer, window_mm=window, finer=2)
+    assert [o.part for o in found.obstacles] == [o.part for o in anew.obstacles]
+    for one, other in zip(found.obstacles, anew.obstacles, strict=True):
+        np.testing.assert_array_equal(one.least_tip_mm, other.least_tip_mm)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
 def test_the_tip_may_go_nowhere_that_the_checker_refuses(seed: int) -> None:
     rng = np.random.default_rng(seed)
     printer, cell_mm, finer = load_setup(printer="prusa_mk3s").printer, 0.1, 2
