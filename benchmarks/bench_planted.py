@@ -114,10 +114,7 @@ def run_job(name: str, high_mm: float, seed: int, folder: Path) -> list[dict[str
     where = places(template, placed, rng)
     plant(world, where, high_mm)
     model = load_world().scanner()
-    pose = seeded_pose(
-        rng, centre_mm=CENTRE_MM, offset_mm=model.offset_mm,
-        tilt_rad=float(np.deg2rad(model.tilt_deg)),
-    )  # fmt: skip
+    pose = seeded_pose(rng, centre_mm=CENTRE_MM, model=model)
     sensors = default_sensors_mm(CENTRE_MM, distance_mm=300.0, oblique=model.oblique_views)
     scanner = SimulatedScanner(world, pose=pose, sensors_mm=sensors, rng=rng, model=model)
     (stop,) = plan_stops(job, [])

@@ -19,6 +19,8 @@ from amrepair.simulate.recording import (
     edge_distance_mm,
 )
 
+CLIP_SIGMAS = 3.0  # of a view's deviations: others are another surface's
+
 
 @dataclass(frozen=True, slots=True)
 class ViewResiduals:
@@ -88,7 +90,7 @@ def view_offset_mm(normals: np.ndarray, deviation_mm: np.ndarray) -> np.ndarray:
     for _ in range(5):
         left = deviation_mm - normals @ shift
         spread = SIGMA_OF_MAD * float(np.median(np.abs(left[use])))
-        near = use & (np.abs(left) <= USUAL_RECORDING.clip_sigmas * max(spread, 1e-6))
+        near = use & (np.abs(left) <= CLIP_SIGMAS * max(spread, 1e-6))
         shift = np.linalg.lstsq(normals[near], deviation_mm[near], rcond=1e-3)[0]
     return np.asarray(shift)
 
