@@ -11,7 +11,7 @@ import numpy as np
 
 from amrepair.repair import RepairPlan
 from gcode.profiles.importers.jobs import read_settings
-from gcode.reader import Job, text_kernels
+from gcode.reader import Job
 
 AROUND_MM = 0.5
 """How far around what is missing its neighbours' beads are asked: about one bead."""
@@ -27,7 +27,8 @@ def other_material(plan: RepairPlan, job: Job, line: int) -> str:
     if len(set(materials)) < 2 or not plan.to_fill:
         return ""
     beads = job.beads
-    tool = job.block.states[beads.line, text_kernels.S_TOOL].astype(int)
+    tools = job.tools
+    tool, now = tools[beads.line], int(tools[line])
     middle_mm = 0.5 * (beads.start_mm + beads.end_mm)
     volume_mm3 = beads.section_mm2 * np.linalg.norm(beads.end_mm - beads.start_mm, axis=1)
     near = np.zeros(len(tool), dtype=bool)
@@ -40,7 +41,6 @@ def other_material(plan: RepairPlan, job: Job, line: int) -> str:
     laid_mm3 = np.bincount(tool[near], volume_mm3[near], minlength=len(materials))
     kinds = sorted(set(materials))
     missing = max(kinds, key=lambda kind: laid_mm3[np.array(materials) == kind].sum())
-    now = job.state_after(line).tool
     held = materials[now] if now < len(materials) else missing
     return "" if held == missing else f"{held} (T{now}), not {missing}"
 

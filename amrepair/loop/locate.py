@@ -134,7 +134,7 @@ def locate_parts(
     ours = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
     outer = ours & of_roles(beads, OUTER_WALLS)
     pick = outer if outer.any() else ours
-    half_mm = float(np.median(_half_beads_mm(beads, pick)))
+    half_mm = _half_bead_mm(beads, pick)
     inset = _Inset(template, half_mm)
     thing = _things(beads.start_mm[ours, :2], beads.end_mm[ours, :2], half_mm)
     if not outer.any():
@@ -338,15 +338,20 @@ def walls_moved_mm(job: Job, template: Template, placed: Transform) -> float:
     pick = (beads.layer >= 0) & of_roles(beads, OUTER_WALLS)
     if not pick.any():
         return 0.0
-    inset = _Inset(template, float(np.median(_half_beads_mm(beads, pick))))
+    inset = _Inset(template, _half_bead_mm(beads, pick))
     walls = _Walls(_walls(beads, np.flatnonzero(pick))).told_off(inset, placed)
     return abs(walls.outside_mm) + abs(walls.stretch) * walls.half_mm
 
 
-def _half_beads_mm(beads: Beads, pick: Mask) -> Float[np.ndarray, " k"]:
-    """(k,) of some beads, as slicers reckon them."""
-    height_mm = np.maximum(beads.height_mm[pick], 1e-6)
-    return np.asarray(0.5 * (beads.section_mm2[pick] / height_mm + BEAD_SIDES_RATIO * height_mm))
+def half_widths_mm(beads: Beads, pick: Mask) -> Float[np.ndarray, " k"]:
+    """(k,) of some beads, as if they were as wide at the top as at the bottom."""
+    return np.asarray(0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6))
+
+
+def _half_bead_mm(beads: Beads, pick: Mask) -> float:
+    """Half of what slicers take some beads to be wide, the median."""
+    sides_mm = 0.5 * BEAD_SIDES_RATIO * beads.height_mm[pick]
+    return float(np.median(half_widths_mm(beads, pick) + sides_mm))
 
 
 def _nth(number: int) -> str:

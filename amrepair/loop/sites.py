@@ -19,6 +19,7 @@ from amrepair.loop.locate import (
     TOWERS,
     first_layer,
     foot_mm,
+    half_widths_mm,
     of_roles,
     tops_of,
     walls_moved_mm,
@@ -183,7 +184,7 @@ def _left_open(job: Job, template: Template, build_from_template: Transform) -> 
         solid.transform(build_from_template.matrix[:3]), BESIDE_CELL_MM, margin_mm=STRINGS_MM
     )
     pick = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
-    half_mm = _half_widths_mm(beads, pick)
+    half_mm = half_widths_mm(beads, pick)
     laid_mm = _heights_mm(beads, pick, half_mm, part.origin_mm, part.z_mm.shape)
     least_mm = LEFT_OPEN_LAYERS * np.median(beads.height_mm[pick])
     lower = (part.z_mm > 0.0) & (part.z_mm - laid_mm > least_mm)
@@ -208,17 +209,12 @@ def _beside(job: Job, which: Mask) -> HeightField | None:
     pick = which & of_roles(beads, BESIDE_THE_PART)
     if not pick.any():
         return None
-    within_mm = _half_widths_mm(beads, pick) + STRINGS_MM
+    within_mm = half_widths_mm(beads, pick) + STRINGS_MM
     low, shape = columns_around(
         beads.start_mm[pick], beads.end_mm[pick], float(within_mm.max()), BESIDE_CELL_MM
     )
     z_mm = _heights_mm(beads, pick, within_mm, low, shape)
     return HeightField(low, BESIDE_CELL_MM, z_mm, np.isfinite(z_mm))
-
-
-def _half_widths_mm(beads: Beads, pick: Mask) -> Float[np.ndarray, " k"]:
-    """(k,) of some beads, as if they were as wide at the top as at the bottom."""
-    return np.asarray(0.5 * beads.section_mm2[pick] / np.maximum(beads.height_mm[pick], 1e-6))
 
 
 def _heights_mm(

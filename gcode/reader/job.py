@@ -115,6 +115,11 @@ class Job:
         """By program line, as `Block.moves`."""
         return self.block.moves()
 
+    @property
+    def tools(self) -> Int[np.ndarray, " m1"]:
+        """(m + 1,) the tool that is chosen before each line, and at the end."""
+        return np.asarray(self.block.states[:, kernels.S_TOOL].astype(np.int64))
+
     def state_after(self, line: int) -> ModalState:
         """The machine's state after lines [0, line).
 

@@ -16,7 +16,7 @@ from gcode.dialects import dialect_of, fan_command, number
 from gcode.errors import InputError
 from gcode.moves import ModalState
 from gcode.profiles import PrinterProfile, PrintSetup
-from gcode.reader import Job, text_kernels
+from gcode.reader import Job
 from gcode.resumption.settings import Settings
 from gcode.slicing.room import bare_place, room_for_line
 from gcode.surfaces import HeightField
@@ -69,8 +69,7 @@ def filament_back_mm(job: Job) -> Float[np.ndarray, " m"]:
     Another filament is loaded as far as it has to be, by whatever changes it.
     """
     pushed_mm = np.concatenate([[0.0], np.cumsum(job.moves()[1])])
-    tool = job.block.states[:, text_kernels.S_TOOL]
-    starts = [0, *(np.flatnonzero(np.diff(tool)) + 1), len(pushed_mm)]
+    starts = [0, *(np.flatnonzero(np.diff(job.tools)) + 1), len(pushed_mm)]
     back_mm = np.empty(len(pushed_mm))
     for first, end in pairwise(starts):
         of_one_mm = pushed_mm[first:end]

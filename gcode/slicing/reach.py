@@ -71,10 +71,9 @@ def _cut(
     And the window in it. A cone's rim, which is 0.6 mm wide, is rounded to cells on the way: by a
     tenth of a millimetre of depth in the field's own.
     """
-    more = math.ceil(around_mm / field.cell_mm) + 3
-    first = [max(w.start - more, 0) for w in window]
-    rows, columns = (slice(a, w.stop + more) for a, w in zip(first, window, strict=True))
-    z_mm = field.z_mm[rows, columns].repeat(finer, axis=1).repeat(finer, axis=0)
+    near = tuple(_wider(w, _cells_within(field, around_mm)) for w in window)
+    first = [w.start for w in near]
+    z_mm = field.z_mm[near].repeat(finer, axis=1).repeat(finer, axis=0)
     seen = np.ones(z_mm.shape, dtype=bool)  # nobody asks
     origin_mm = field.origin_mm + np.array(first[::-1]) * field.cell_mm
     y, x = (
@@ -82,6 +81,16 @@ def _cut(
         for a, w in zip(first, window, strict=True)
     )
     return HeightField(origin_mm, field.cell_mm / finer, z_mm, seen), (y, x)
+
+
+def _cells_within(field: HeightField, around_mm: float) -> int:
+    """Cells that what reaches so far may touch, rounding and margins included."""
+    return math.ceil(around_mm / field.cell_mm) + 3
+
+
+def _wider(window: slice, more: int) -> slice:
+    """So many cells more on both sides; a slice may end beyond its field, not begin before it."""
+    return slice(max(window.start - more, 0), window.stop + more)
 
 
 class Reach:
@@ -141,15 +150,14 @@ class Reach:
         known = [o for o in before.obstacles if o.part == part] if before is not None else []
         if before is None or not known or part.widening_mm > 0:
             return least_tip(part, self._whole, window, finer)
-        more = math.ceil(part.reach_mm / self._whole.cell_mm) + 3
-        first = [max(w.start - more, 0) for w in window]
-        near = tuple(slice(a, w.stop + more) for a, w in zip(first, window, strict=True))
+        more = _cells_within(self._whole, part.reach_mm)
+        near = tuple(_wider(w, more) for w in window)
         changed = self._whole.z_mm[near] != before._whole.z_mm[near]
         if not changed.any():
             return known[0].least_tip_mm
         around = []
-        for axis, (a, w) in enumerate(zip(first, window, strict=True)):
-            at = a + np.flatnonzero(changed.any(axis=1 - axis))
+        for axis, (beside, w) in enumerate(zip(near, window, strict=True)):
+            at = beside.start + np.flatnonzero(changed.any(axis=1 - axis))
             around.append(slice(max(at[0] - more, w.start), min(at[-1] + 1 + more, w.stop)))
         least = known[0].least_tip_mm.copy()
         rows, columns = (

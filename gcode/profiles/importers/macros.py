@@ -61,11 +61,10 @@ def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
 
     There are as many as nozzles, as scripts name, and as filaments were loaded.
     """
-    nozzles = len(settings.get("nozzle_diameter", "").split(","))
+    nozzles, loaded = _told_for(settings)
     texts = list(_scripts(settings))
     tools = (int(tool) for text in texts for tool in _CHOSEN.findall(text))
     named = [1 + tool for tool in tools if tool < MOST_HEADS]
-    loaded = len(settings.get("filament_type", "").split(";"))
     shared = settings.get("single_extruder_multi_material", "0") == "1"
     heated = any(_HEATED.search(text) for text in texts)
     one_nozzle = not heated and (shared or nozzles == 1)
@@ -95,17 +94,23 @@ def of_head(values: Mapping[str, str], head: int, filament_keys: Collection[str]
     filament_keys
         Keys that tell a value for each filament; what tells one for each nozzle is known.
     """
-    filaments = len(values.get("filament_type", "").split(";"))
-    nozzles = len(values.get("nozzle_diameter", "").split(","))
+    nozzles, filaments = _told_for(values)
     made = dict(values)
     for key, text in values.items():
-        count = nozzles if _OF_A_NOZZLE.fullmatch(key) else filaments
-        if count < 2 or not (_OF_A_NOZZLE.fullmatch(key) or key in filament_keys):
+        of_nozzle = _OF_A_NOZZLE.fullmatch(key) is not None
+        count = nozzles if of_nozzle else filaments
+        if count < 2 or not (of_nozzle or key in filament_keys):
             continue
         several = text.split(";" if ";" in text else ",")
         if len(several) == count and head < count:
             made[key] = several[head].strip()
     return made
+
+
+def _told_for(settings: Mapping[str, str]) -> tuple[int, int]:
+    """For how many nozzles, and for how many filaments, settings tell values."""
+    nozzles, filaments = settings.get("nozzle_diameter", ""), settings.get("filament_type", "")
+    return len(nozzles.split(",")), len(filaments.split(";"))
 
 
 def ends_homing(settings: Mapping[str, str]) -> bool:
