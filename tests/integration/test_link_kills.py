@@ -33,17 +33,18 @@ def forks() -> Iterator[Forks]:
 class Gallows:
     """One bench, many deaths; `seen` counts what came of them.
 
-    Kills come up to `job_s` after the start, from before the hello to about the last line: what a
-    job takes that nobody kills, on this machine and under what else it does now.
+    Kills come up to `job_s` after the start, from before the hello to about the last line: what
+    the last job took that nobody killed, on this machine and under what else it did then.
     """
+
+    began_s: float | None
 
     def __init__(self, forks: Forks, folder: Path, seed: int) -> None:
         self.bench = Bench(forks, folder, lines=LINES, slow=False)
         self.forks, self.rng, self.seen = forks, random.Random(seed), Counter[str]()
-        began_s = time.monotonic()
-        assert forks.wait(self.bench.send()) == 0
-        self.job_s = time.monotonic() - began_s
-        self.bench.record.write_text("")  # the next job
+        self.job_s = 0.0
+        assert forks.wait(self.start()) == 0
+        self.next_job(ended=True)
 
     def moment(self) -> None:
         """Let a random time pass: a kill waits for no event."""
@@ -53,7 +54,14 @@ class Gallows:
         """Go on where something has been printed, else begin."""
         go_on = bool(self.bench.executed())
         self.seen["gone on" if go_on else "begun"] += 1
+        self.began_s = None if go_on else time.time()
         return self.bench.send(go_on=go_on)
+
+    def next_job(self, *, ended: bool) -> None:
+        """Begin a record; of a job that was printed from first line to last take its time."""
+        if ended and self.began_s is not None:
+            self.job_s = self.bench.record.stat().st_mtime - self.began_s
+        self.bench.record.write_text("")
 
     def kill_sender(self) -> None:
         bench = self.bench
@@ -70,7 +78,7 @@ class Gallows:
             self.await_cold()
         self.judge(finished=status == 0)
         if status != -9:
-            bench.record.write_text("")  # the next job
+            self.next_job(ended=status == 0)
 
     def kill_printer(self) -> None:
         bench = self.bench
@@ -97,7 +105,7 @@ class Gallows:
             assert "cannot be resumed" in bench.go_on()["error"]
             assert len(bench.executed()) == done
             self.seen["resets refused"] += 1
-        bench.record.write_text("")
+        self.next_job(ended=status == 0)
 
     def judge(self, *, finished: bool) -> None:
         """In order, none twice, none left out; the journal whole and never behind the truth."""
