@@ -13,8 +13,6 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from tests import shapes
-
 # Workers share the cores: threads of one that spin for their turn take the other's time.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     _share = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
@@ -23,8 +21,8 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 
 # a shell that starts the tests in the background has them ignore what some of them send
 signal.signal(signal.SIGINT, signal.default_int_handler)
-shapes.install(["amrepair", "gcode"])
-importlib.import_module("gcode.process").prepare()  # as the commands do
+importlib.import_module("gcode.process").prepare()  # as the commands do, before numpy is loaded
+importlib.import_module("tests.shapes").install(["amrepair", "gcode"])
 
 hypothesis.settings.register_profile(
     "suite",
