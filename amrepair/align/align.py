@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +16,14 @@ from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.sizes import other_size, refuse_other_size
 from amrepair.align.thinning import in_order, thin_out
-from amrepair.arrays import Matrix, Points
+from amrepair.arrays import Mask, Matrix, Points
 from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, in_box, moved, turned_rad
 from amrepair.scans import Scan
 from amrepair.template.port import Template, is_off_bed
 from gcode.progress import Progress, silent
 
+Aside = Callable[[Points], Mask]
 ALIGN_METHODS = ("robust", "paper")
 LOOK_AT = 5_000  # repeats of a few places show in a sample
 ALONG = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # places that differ along it differ
@@ -50,6 +52,7 @@ def align(
     method: str = "robust",
     guess: Transform | None = None,
     so_far: SoFar | None = None,
+    aside: Aside | None = None,
     part_is_known: bool = False,
     options: AlignOptions = USUAL_ALIGN,
     rng: np.random.Generator | None = None,
@@ -67,6 +70,9 @@ def align(
         What a guess is refined on in mid-print, where walls and infill lie open that no drawing
         has: drawn walls alone pull the pose aside by tenths of a millimetre where one is missing.
         The bed is found by `template` all the same.
+    aside
+        Which points, template frame, lie on what is known to stand beside the part, as supports:
+        a guess is refined without them, and they are not counted as what does not fit.
     part_is_known
         The scan is of this part and no mirror image, however bent: less of it has to fit.
     options
@@ -118,7 +124,7 @@ def align(
             f"the guess starts from frame {guess.source}, the scan {scan.source} is in {scan.frame}"
         )
     sigma_mm, inlier_mm = options.explained.limits_mm(scan.sigma_mm)
-    refined = _from_guess(scan, template, so_far, guess, sigma_mm, options, rng)
+    refined = _from_guess(scan, template, so_far, aside, guess, sigma_mm, options, rng)
     progress("align", 1.0, 1.0)
     ratio = float((np.abs(refined.residual_mm) <= inlier_mm).mean())
     _refuse_misfit(scan, refined, ratio, inlier_mm, options.guess.least_explained, "")
@@ -279,6 +285,7 @@ def _from_guess(
     scan: Scan,
     template: Template,
     so_far: SoFar | None,
+    aside: Aside | None,
     guess: Transform,
     sigma_mm: float,
     options: AlignOptions,
@@ -291,6 +298,8 @@ def _from_guess(
         levelled, on_bed = level_on_bed(scan.points_mm, template, guess.matrix, options.bed)
     step = max(1, len(scan) // options.guess.most_points)
     points = _part_only(scan.points_mm[::step], template, levelled, options)
+    if aside is not None:
+        points = np.compress(~aside(moved(points, levelled)), points, axis=0)
     if so_far is not None:
         points = np.compress(moved(points, levelled)[:, 2] > so_far.from_mm, points, axis=0)
     if len(points) < least:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -9,12 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align import AlignOptions, SoFar
+from amrepair.arrays import Mask, Points
 from amrepair.frames import Transform, unit_vectors
 from amrepair.regions.sites import RoundedUp
+from amrepair.repair.options import RepairOptions
 from amrepair.repair.site import Site
 from amrepair.scans import Scan
 from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template, is_off_bed
+from gcode.surfaces import HeightField
 
 
 def so_far(site: Site) -> SoFar | None:
@@ -35,22 +39,42 @@ def is_cut(site: Site) -> bool:
 
 def of_the_part(scan: Scan, site: Site) -> Scan:
     """Without what the job laid beside the part."""
+    aside = laid_aside(site)
+    if aside is None:
+        return scan
+    beside = aside(scan.points_mm)
+    return scan.subset(~beside) if beside.any() else scan
+
+
+def laid_aside(site: Site) -> Callable[[Points], Mask] | None:
+    """Which points, template frame, lie on what the job laid beside the part; None where nothing.
+
+    Below its top seen from above, off the bed, and off the part.
+    """
     if site.beside is None or site.build_from_template is None:
-        return scan
-    placed = site.build_from_template
-    height_mm = scan.points_mm @ placed.rotation[2] + placed.translation_mm[2]
+        return None
+    return partial(_laid_aside, site.beside, site.build_from_template, site.template, site.options)
+
+
+def _laid_aside(
+    beside: HeightField,
+    placed: Transform,
+    template: Template,
+    options: RepairOptions,
+    points_mm: Points,
+) -> Mask:
+    height_mm = points_mm @ placed.rotation[2] + placed.translation_mm[2]
     # what lies nearly on the bed is taken for it anyhow
-    over_mm = site.options.over_beside_mm
-    over_bed = (height_mm > site.options.on_bed_mm) & (height_mm < site.beside.top_mm + over_mm)
+    over_mm = options.over_beside_mm
+    over_bed = (height_mm > options.on_bed_mm) & (height_mm < beside.top_mm + over_mm)
     low = np.flatnonzero(over_bed)
-    xy_mm = placed.apply(scan.points_mm[low])[:, :2]
-    high_mm = site.beside.sample(xy_mm, outside_mm=-np.inf) + over_mm
+    xy_mm = placed.apply(points_mm[low])[:, :2]
+    high_mm = beside.sample(xy_mm, outside_mm=-np.inf) + over_mm
     low = low[height_mm[low] < high_mm]
-    if not len(low):
-        return scan
-    keep = np.ones(len(scan), dtype=bool)
-    keep[low] = site.template.distance(scan.points_mm[low]) < site.options.off_the_part_mm
-    return scan.subset(keep)
+    aside = np.zeros(len(points_mm), dtype=bool)
+    if len(low):
+        aside[low] = template.distance(points_mm[low]) >= options.off_the_part_mm
+    return aside
 
 
 def told_to_go_beyond(site: Site, placed: Transform) -> RoundedUp | None:

@@ -179,6 +179,7 @@ def _align(
                 site.template,
                 guess=guess,
                 so_far=in_view.so_far(site),
+                aside=in_view.laid_aside(site),
                 options=in_view.aligning(site),
                 rng=rng,
                 progress=progress,
