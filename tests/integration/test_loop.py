@@ -37,8 +37,8 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def template() -> MeshSdf:
-    block = trimesh.creation.box(bounds=((0, 0, 0), (24, 18, 3)))
-    step = trimesh.creation.box(bounds=((3, 3, 2.9), (16, 14, 4.6)))
+    block = trimesh.creation.box(bounds=((0, 0, 0), (18, 14, 3)))
+    step = trimesh.creation.box(bounds=((3, 3, 2.9), (13, 11, 4.2)))
     return MeshSdf.from_mesh(trimesh.boolean.union([block, step], engine="manifold"))
 
 

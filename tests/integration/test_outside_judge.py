@@ -76,7 +76,10 @@ def _scan(solid: Solid, seed: int) -> Scan:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow) if n in ("boss", "worn edge") else n for n in TOOLS],
+    [
+        pytest.param(n, marks=pytest.mark.slow) if n in ("boss", "worn edge", "notch") else n
+        for n in TOOLS
+    ],
 )
 def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
     tool, least_filled = TOOLS[name]

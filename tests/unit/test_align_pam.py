@@ -76,6 +76,7 @@ def test_without_ransac_it_stays_where_it_started(template: MeshSdf) -> None:
         run(template, points, replace(STRICT, ransac=False, iterate=False))
 
 
+@pytest.mark.slow
 def test_without_icp_it_is_coarse(template: MeshSdf) -> None:
     points, truth = turned(cloud(template, 3), 3, 2.0)
     off_mm = {}

@@ -106,6 +106,7 @@ def test_forward_pass_is_the_published_architecture(tmp_path: Path, kind: str) -
     assert torch.allclose(found, expected, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_features_do_not_depend_on_unit_or_place(tmp_path: Path) -> None:
     model = load_checkpoint(
         save(tmp_path / "w.pth", "pointmae", random_weights("pointmae")), "pointmae"

@@ -90,7 +90,7 @@ def test_noise_and_spacing_are_measured(part: AnalyticTemplate) -> None:
 
 
 def test_normals_point_outwards_also_in_the_hole(part: AnalyticTemplate) -> None:
-    points = points_of(part, 30_000, 1)
+    points = points_of(part, 15_000, 1)
     spacing_mm = spacing_of(points)
     normals = outward(points, planes(points, spacing_mm).normals, spacing_mm, SIGMA_MM)
     gradient = part.distance_and_gradient(points)[1]
@@ -118,8 +118,8 @@ def test_a_hollow_that_one_scan_alone_saw_into_is_kept() -> None:
     """The others have a wall above it, which the scan has, too: that contradicts nothing."""
     step = difference(box((0, 0, 0), (40, 30, 12)), box((10, 8, 4), (30, 22, 13)))
     clouds = []
-    for seed in range(4):
-        points = sample_surface(step.body, 0.8, seed=seed)[0]
+    for seed in range(3):
+        points = sample_surface(step.body, 1.0, seed=seed)[0]
         points += np.random.default_rng(seed).normal(0.0, 0.03, points.shape)
         floor = (abs(points - (20, 15, 4)) < (9.9, 6.9, 0.5)).all(axis=1)
         shelf = (points[:, 2] > 3.0) & (points[:, 2] < 11.0) & floor
@@ -159,7 +159,7 @@ def test_a_template_from_scans_is_the_part(part: AnalyticTemplate, tmp_path: Pat
 
 
 def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
-    clouds = [points_of(part, 30_000, s) for s in range(4)]
+    clouds = [points_of(part, 16_000, s) for s in range(4)]
     spot = np.array([20.0, 20.0, 8.0])
     near = np.linalg.norm(clouds[2] - spot, axis=1) < 3.0
     clouds[2][near & (clouds[2][:, 2] > 7.5), 2] += 1.5  # a bulge
@@ -167,9 +167,10 @@ def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
     clouds[3][rim & (clouds[3][:, 2] > 7.5), 2] -= 0.15  # a dent, within reach of the fit
     fused = fuse(joined(clouds))
     assert fused.rejected > 100
-    assert np.quantile(fused_error(fused, part), 0.999) < 0.2
-    assert fused_error(fused, part).max() < 0.5  # specks at edges; the bulge has 1.5
-    assert fused_error(fused, part).mean() < 0.015
+    error_mm = fused_error(fused, part)
+    assert np.quantile(error_mm, 0.999) < 0.2
+    assert error_mm.max() < 0.5  # specks at edges; the bulge has 1.5
+    assert error_mm.mean() < 0.02
     # the two that are defective stand out, each where it is
     assert fused.outvoted_mm2[2] > 5.0 * fused.outvoted_mm2[:2].max()
     assert np.linalg.norm(fused.outvoted_at_mm[2] - spot) < 3.0
