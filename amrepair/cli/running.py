@@ -27,10 +27,11 @@ from amrepair.loop import (
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
+from amrepair.loop.in_turn import refuse_own_hits
 from amrepair.loop.locate import is_upright, locate_parts, stood
 from amrepair.loop.marks import marked_stops
 from amrepair.loop.options import UNASKED
-from amrepair.loop.pace import layers_at
+from amrepair.loop.pace import layers_at, layers_every
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.probing import ProbeScanner
 from amrepair.loop.setting import Setting, forget, keep, open_run
@@ -206,7 +207,8 @@ def new_run(
             "or name another folder with --out"
         )
     job = job_for(text, setup.printer)
-    fixed = range(looks.every - 1, len(job.layers) - 1, looks.every) if looks.every else []
+    refuse_own_hits(job, setup)
+    fixed = layers_every(job, looks.every)
     pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0
     layers = [*looks.at_layers, *layers_at(job, looks.at_mm), *([] if pace else fixed)]
     stops = (
@@ -229,7 +231,7 @@ def new_run(
             expected, build_from_template = stood(field, placed)
     tell_warnings(job_file, checked.report)
     if expected is not field:
-        console.errors.print(_how_it_stands(placed))
+        console.errors.print(_how_it_stands(placed, in_turn=len(job.turns) > 1))
     ids = (
         own.keep(out / PROFILES, *named[1:])
         if own is not None
@@ -246,12 +248,15 @@ def new_run(
     return Begun(setting, setup, job, expected, stops, folder, checked, Tape(out))
 
 
-def _how_it_stands(placed: tuple[Transform, ...]) -> str:
+def _how_it_stands(placed: tuple[Transform, ...], *, in_turn: bool) -> str:
     """What a person should know of a template that is not as its file has it."""
     lying = "" if is_upright(placed[0]) else ", lying in another way than its file has it"
     if len(placed) == 1:
         return f"The job prints the part{lying}; it is looked at so."
-    return f"The job prints {len(placed)} copies of the part{lying}; all of them are looked at."
+    every = f"The job prints {len(placed)} copies of the part{lying}"
+    if in_turn:
+        return f"{every}, one after the other; each is looked at up to its own end."
+    return f"{every}; all of them are looked at."
 
 
 def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: str | None) -> Begun:

@@ -239,6 +239,36 @@ def with_what_stands_out(
     return field.raised(z_mm)
 
 
+def raised_to_points(
+    field: HeightField, points_mm: Points, options: HeightOptions = USUAL_DEFICIT.heights
+) -> HeightField:
+    """As high as the topmost surface that points, build frame, show in each cell, or higher."""
+    top_mm, seen = _tops(points_mm, field, options)
+    return field.raised(np.where(seen, top_mm, -np.inf))
+
+
+def with_others(field: HeightField, others: HeightField) -> HeightField:
+    """A field, and what stands in another one far beside it: one field over both, in its cells."""
+    rows, columns = np.nonzero(others.z_mm > 0.0)
+    if not len(rows):
+        return field
+    step = others.cell_mm
+    low_mm = others.origin_mm + step * np.array([columns.min(), rows.min()])
+    high_mm = others.origin_mm + step * np.array([columns.max() + 1, rows.max() + 1])
+    box_mm, cell_mm = np.array(field.box_mm), field.cell_mm
+    before = np.maximum(np.ceil((box_mm[:2] - low_mm) / cell_mm), 0.0).astype(np.int64)
+    behind = np.maximum(np.ceil((high_mm - box_mm[2:]) / cell_mm), 0.0).astype(np.int64)
+    around = [(int(before[k]), int(behind[k])) for k in (1, 0)]
+    bare = HeightField(
+        field.origin_mm - before * cell_mm,
+        cell_mm,
+        np.pad(field.z_mm.astype(np.float64), around),
+        np.pad(field.seen, around, constant_values=True),
+    )
+    iy, ix = cells_over(others, bare)
+    return bare.raised(others.z_mm[iy, ix])
+
+
 def _without_rims_fins(
     z_mm: HeightMap, gone: ColumnMask, seen_mm: HeightMap, options: HeightOptions
 ) -> HeightMap:

@@ -64,7 +64,7 @@ def afterwards(
     command
         That makes the job that is left, without the layer.
     """
-    (end,) = plan_stops(job, ())
+    *_, end = plan_stops(job, ())
     pieces = () if plan.patch is None else plan.patch.regions
     left = buried(pieces, end, plan.layer_height_mm, plan.policy)
     open_mm3 = buried_mm3(left)
@@ -82,6 +82,8 @@ def afterwards(
 
 def _why_not_again(job: Job, template: Template, placed: Transform, setup: PrintSetup) -> str:
     """Why a job's later layers would not fall onto a part that stands there; empty if they do."""
+    if len(job.turns) > 1:
+        return "it prints its objects one after the other"
     try:
         copies = locate_parts(job, template, layer_height_mm=setup.process.layer_height_mm)
     except AlignmentError as error:

@@ -64,7 +64,7 @@ def ways(
     """
     open_mm3 = buried_mm3(pieces)
     leave = Way("leave", 0.0, open_mm3)
-    first = _first_layer(job, min(piece.box_mm[2] for piece in pieces))
+    first = _first_layer(job, stop, min(piece.box_mm[2] for piece in pieces))
     if first is None:
         return (leave,)
     beads, layer = job.beads, job.layers[first]
@@ -80,13 +80,15 @@ def ways(
     return (reprint, leave)
 
 
-def _first_layer(job: Job, low_mm: float) -> int | None:
+def _first_layer(job: Job, stop: Stop, low_mm: float) -> int | None:
     """The layer in which something begins; None in the first one."""
-    tops_mm = np.array([layer.z_mm for layer in job.layers])
-    half_mm = np.array([0.5 * layer.height_mm for layer in job.layers])
+    turn = job.turn_at(stop.line)
+    layers = job.layers[turn.first_layer : turn.end_layer]
+    tops_mm = np.array([layer.z_mm for layer in layers])
+    half_mm = np.array([0.5 * layer.height_mm for layer in layers])
     # less of a layer than half is what solids are wrong by
     over = np.flatnonzero(tops_mm - half_mm > low_mm)
-    return int(over[0]) if len(over) and over[0] > 0 else None
+    return turn.first_layer + int(over[0]) if len(over) and over[0] > 0 else None
 
 
 def _seconds(job: Job, line: int, setup: PrintSetup) -> float:

@@ -24,7 +24,7 @@ from amrepair.loop.learning import Learning, to_json, told
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
-from amrepair.loop.objects import Course, Objects
+from amrepair.loop.objects import Course, Objects, is_laid
 from amrepair.loop.options import Approval, LoopOptions, Records
 from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
@@ -66,6 +66,7 @@ class Run:
         self._job, self._checked, self._printer, self._scanner = job, checked, printer, scanner
         self._base = 0  # of the job's lines, the one that the program under way begins with
         self._objects, self._course, self._stops = Objects.of(job), Course(job), tuple(stops)
+        self._turns = job.turns
         self._site_at, self._options, self._approval = site_at, options, approval
         self._keep_scan, self._record = records.scan, records.look
         self._tape, self._watch = records.tape, records.watch
@@ -146,13 +147,13 @@ class Run:
         if self._tape.only_read:
             return self._again(stop)
         now = self._course.stop(stop)
-        if now is None:
+        if now is None or not is_laid(self._job, now):
             return True  # nothing is printed there any more
         pulled_mm, began = self._wire.pulled_at_rest_mm(), self._checked
         state = state_at_rest(self._job, now.line, paused_mm=pulled_mm)
         site = self._expected(stop, now)
         with self._watch("print"):
-            program, parked = travel.park(site.setup, state)
+            program, parked = travel.park(site.setup, state, site.others)
             self._wire.send("park", program)
         while True:
             look = self._try_to_look(stop, site, parked)
@@ -178,7 +179,7 @@ class Run:
         if self._checked is not began:
             return True  # what is left of the job begins where the nozzle rests
         with self._watch("print"):
-            for program in travel.way_back(site.setup, state, parked):
+            for program in travel.way_back(site.setup, state, parked, site.others):
                 self._wire.send("back", program)
             if look is not None:
                 self._change_next(stop, site, look)
@@ -244,7 +245,7 @@ class Run:
         if self._tape.live:
             raise TapeEndsError("the record ends here")
         site = self._site_at(stop)
-        _, parked = travel.park(site.setup, self._job.state_after(stop.line))
+        _, parked = travel.park(site.setup, self._job.state_after(stop.line), site.others)
         while self._tape.next_stop() == stop.label:
             self._try_to_look(stop, site, parked)
         return True
@@ -310,7 +311,8 @@ class Run:
         """What the scanner sees, as a file keeps it."""
         with self._watch("scan"):
             self._progress(f"scan {stop.label}", 0.0, 1.0)
-            request = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
+            layers = None if stop.number is None else self._turns[stop.number - 1].end_layer
+            request = ScanRequest(stop.label, stop.layer_index, stop.z_mm, layers)
             scan = as_recorded(self._scanner.scan(request))
             self._progress(f"scan {stop.label}", 1.0, 1.0)
         return scan

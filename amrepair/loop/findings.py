@@ -45,6 +45,18 @@ def next_layer(job: Job, layer_index: int | None) -> int | None:
     return layer_index + 1
 
 
+def _line_after(job: Job, layer_index: int | None, line: int) -> int:
+    """The line before which the head may next run into what stands out here.
+
+    That of the next layer's end; of an object that is finished, of the end of the next one.
+    """
+    after = next_layer(job, layer_index)
+    if after is not None:
+        return job.layers[after].end_line
+    turns = job.turns
+    return turns[min(job.turn_at(line).index + 1, len(turns) - 1)].end_line if turns[1:] else line
+
+
 def cover_of(job: Job, layer_index: int | None, box_mm: Box) -> Cover:
     """What the next layer lays over a box."""
     layer = next_layer(job, layer_index)
@@ -135,8 +147,7 @@ def findings(
     objects
         The job's, where it is printed on without those that cannot be repaired.
     """
-    after = next_layer(job, layer_index)
-    end_line = job.layers[after].end_line if after is not None else line
+    end_line = _line_after(job, layer_index, line)
     pieces = plan.deficit.excess.decompose() if not plan.deficit.excess.is_empty() else []
     found = []
     regions = plan.deficit.regions
@@ -149,7 +160,7 @@ def findings(
         reach, hit = 1.0, 0.0
         if region.label is Label.MISSING:
             reach = reach_of(plan, region.box_mm)
-        elif after is not None and height_mm(region) >= LEAST_HIT_LAYERS * plan.layer_height_mm:
+        elif end_line > line and height_mm(region) >= LEAST_HIT_LAYERS * plan.layer_height_mm:
             piece = matching(pieces, region.box_mm)
             if piece is not None:
                 hit = hit_mm(job, setup, piece, line=line, end_line=end_line)

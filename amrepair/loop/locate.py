@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from scipy import ndimage
 
 from amrepair.align import align
 from amrepair.arrays import Box, Mask, Numbers, PlanePoints, Points, Values
-from amrepair.errors import AlignmentError, InputError
+from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, box_of, rotation_from_vector
 from amrepair.loop.outlines import outermost
 from amrepair.scans import Scan
@@ -126,10 +125,7 @@ def locate_parts(
     AlignmentError
         If walls do not fit the template to half a layer: another part, another scale, or one that
         stands beside ours.
-    InputError
-        If the job prints its objects one after the other.
     """
-    _refuse_one_after_another(job)
     beads = job.beads
     ours = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
     outer = ours & of_roles(beads, OUTER_WALLS)
@@ -162,10 +158,10 @@ def locate_parts(
                 "prints copies of one part"
             ) from error
     progress("locate", float(count), float(count))
-    begins_mm = foot_mm(job)
+    layers = [int(beads.layer[ours][thing == k].min(initial=0)) for k in range(count)]
     return tuple(
-        _on_foot(_untilted(placed, template), template, begins_mm, layer_height_mm)
-        for placed in found
+        _on_foot(_untilted(placed, template), template, _begins_mm(job, layer), layer_height_mm)
+        for placed, layer in zip(found, layers, strict=True)
     )
 
 
@@ -373,19 +369,11 @@ def _untilted(placed: Transform, template: Template) -> Transform:
     )
 
 
-def _refuse_one_after_another(job: Job) -> None:
-    for before, after in pairwise(job.layers):
-        if after.z_mm < before.z_mm - max(before.height_mm, after.height_mm):
-            raise InputError(
-                f"the job prints its objects one after the other: layer {after.index} is laid at "
-                f"{after.z_mm:g} mm after one at {before.z_mm:g} mm; between them the head has no "
-                "way round what stands already, so slice them layer by layer (without 'complete "
-                "individual objects', 'one at a time')"
-            )
-
-
 def first_layer(job: Job) -> int:
-    """The first layer that has beads of a part in it; those before are a raft, seldom any."""
+    """The first layer that has beads of a part in it; those before are a raft, seldom any.
+
+    Of a job that prints one object after another, this is the first object's (`Job.of_turn`).
+    """
     ours = job.beads.layer[~of_roles(job.beads, BESIDE_THE_PART)]
     return int(ours[ours >= 0].min()) if (ours >= 0).any() else 0
 
@@ -396,16 +384,23 @@ def tops_of(job: Job) -> list[float]:
     Cura lays the first layer over a raft's gap so.
     """
     tops_mm = [layer.z_mm for layer in job.layers]
-    for k in range(len(tops_mm) - 2, -1, -1):
-        if tops_mm[k] >= tops_mm[k + 1]:
-            tops_mm[k] = tops_mm[k + 1] - job.layers[k + 1].height_mm
+    for turn in job.turns:
+        for k in range(turn.end_layer - 2, turn.first_layer - 1, -1):
+            if tops_mm[k] >= tops_mm[k + 1]:
+                tops_mm[k] = tops_mm[k + 1] - job.layers[k + 1].height_mm
     return tops_mm
+
+
+def _begins_mm(job: Job, layer: int) -> float:
+    """Where the part begins of which a layer is one."""
+    own = next(turn for turn in job.turns if layer < turn.end_layer)
+    return foot_mm(job.of_turn(own))
 
 
 def foot_mm(job: Job) -> float:
     """Where a part's lowest layer begins: on the bed, or on the raft that the job lays before."""
     beads, first = job.beads, first_layer(job)
-    if first == 0:
+    if any(first == turn.first_layer for turn in job.turns):
         return 0.0
     lowest = (beads.layer == first) & ~of_roles(beads, BESIDE_THE_PART)
     over = [layer.height_mm for layer in job.layers[first + 1 :]]  # the first one's may have a gap

@@ -19,7 +19,7 @@ from amrepair.regions.calibration import Calibration
 from amrepair.repair import RepairPlan
 from amrepair.scans import Scan
 from gcode.hosts.port import PrintReport
-from gcode.reader import Job
+from gcode.reader import Job, Turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +33,23 @@ class Stop:
     line
         The first program line that is not yet sent.
     z_mm
-        Height printed so far, build frame.
+        Height printed so far, build frame; of the object that is under way.
+    number
+        Of objects that are printed one after another, the one that is finished, counted from 1;
+        None where a job prints all at once, and in the midst of an object.
     """
 
     layer_index: int | None
     line: int
     z_mm: float
+    number: int | None = None
 
     @property
     def label(self) -> str:
-        """`layer-044` or `final`."""
-        return "final" if self.layer_index is None else f"layer-{self.layer_index:03d}"
+        """`layer-044`, `final`, or `final-2`."""
+        if self.layer_index is not None:
+            return f"layer-{self.layer_index:03d}"
+        return "final" if self.number is None else f"final-{self.number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +158,7 @@ def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
 
 
 def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[Stop, ...]:
-    """Stops after the given layers, rising, and one for the finished part.
+    """Stops after the given layers, in the job's order, and one for each finished part.
 
     Where only the raft is laid there is nothing to look at, and no stop.
 
@@ -161,19 +167,28 @@ def plan_stops(job: Job, layers: Sequence[int], *, final: bool = True) -> tuple[
     InputError
         If the job has no such layer.
     """
-    stops, first = [], first_layer(job)
-    for index in sorted(set(layers)):
-        if not 0 <= index < len(job.layers):
-            raise InputError(
-                f"there is no layer {index} to stop after; the job has layers 0 to "
-                f"{len(job.layers) - 1}"
-            )
-        layer = job.layers[index]
-        if first <= index and (index < len(job.layers) - 1 or not final):
-            stops.append(Stop(index, layer.end_line, layer.z_mm))
-    if final:
-        stops.append(Stop(None, job.footer_start_line, job.layers[-1].z_mm))
+    asked, stops = sorted(set(layers)), []
+    wrong = [index for index in asked if not 0 <= index < len(job.layers)]
+    if wrong:
+        raise InputError(
+            f"there is no layer {wrong[0]} to stop after; the job has layers 0 to "
+            f"{len(job.layers) - 1}"
+        )
+    for turn in job.turns:
+        first = first_layer(job.of_turn(turn))
+        end = turn.end_layer - final
+        for layer in (job.layers[index] for index in asked if first <= index < end):
+            stops.append(Stop(layer.index, layer.end_line, layer.z_mm))
+        if final:
+            stops.append(end_stop(job, turn))
     return tuple(stops)
+
+
+def end_stop(job: Job, turn: Turn, line: int | None = None) -> Stop:
+    """The stop at which what one turn prints is finished; at its last bead, or another line."""
+    number = turn.index + 1 if len(job.turns) > 1 else None
+    z_mm = job.layers[turn.end_layer - 1].z_mm
+    return Stop(None, job.end_of(turn) if line is None else line, z_mm, number)
 
 
 def look_to_json(look: Look) -> dict[str, object]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 
 from amrepair.errors import InputError
-from amrepair.loop.looks import Stop
+from amrepair.loop.looks import Stop, end_stop
 from gcode.reader import Job
 
 LOOK_MARK = ";AMREPAIR_LOOK"
@@ -18,7 +18,7 @@ _MARKED = re.compile(rf"^{LOOK_MARK} LAYER=(\d+) Z=(\S+)\s*$")
 
 
 def marked_stops(job: Job, name: str, *, start: int = 0) -> tuple[Stop, ...]:
-    """The stops of a job at its marks; the last layer's is the finished part's.
+    """The stops of a job at its marks; those at the last layer of a part are its own.
 
     Parameters
     ----------
@@ -32,6 +32,7 @@ def marked_stops(job: Job, name: str, *, start: int = 0) -> tuple[Stop, ...]:
     """
     lines = job.program.text.split("\n")
     stops = []
+    ends = {turn.end_layer - 1: turn for turn in job.turns}
     for number, line in enumerate(lines[:-1]):
         if (found := _MARKED.match(line)) is None:
             continue
@@ -44,8 +45,12 @@ def marked_stops(job: Job, name: str, *, start: int = 0) -> tuple[Stop, ...]:
         layer = int(found.group(1))
         if layer >= len(job.layers):
             raise InputError(f"{name}: line {number + 1} marks layer {layer}, which is not there")
-        last = layer == len(job.layers) - 1
-        stops.append(Stop(None if last else layer, number + 2, job.layers[layer].z_mm))
+        turn = ends.get(layer)
+        stops.append(
+            Stop(layer, number + 2, job.layers[layer].z_mm)
+            if turn is None
+            else end_stop(job, turn, number + 2)
+        )
     if not stops:
         raise InputError(
             f"{name} has no looks in it; name 'amrepair postprocess' in the slicer's "

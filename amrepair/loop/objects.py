@@ -82,6 +82,18 @@ class Objects:
         return without_beads(self.job, self.found, names, line)
 
 
+def is_laid(job: Job, stop: Stop) -> bool:
+    """Whether the job still prints what a stop would look at.
+
+    Of objects that are printed one after another, one that was given up comes no higher.
+    """
+    if stop.number is None and len(job.turns) == 1:
+        return True
+    before = int(np.searchsorted(job.beads.line, stop.line)) - 1
+    layer = int(job.beads.layer[before]) if before >= 0 else -1
+    return layer >= 0 and abs(job.layers[layer].z_mm - stop.z_mm) < SAME_Z_MM
+
+
 @dataclass(frozen=True, slots=True)
 class Course:
     """Where the job's lines are now: as the run was begun with, or written anew since.
@@ -107,13 +119,15 @@ class Course:
         """A stop of the first job as it is now; None where its layer is not printed any more."""
         if self.line_of is None:
             return stop
+        now = replace(stop, line=self.line(stop.line))
         if stop.layer_index is None:
-            return replace(stop, line=self.line(stop.line))
+            return now
         tops = np.array([layer.z_mm for layer in self.job.layers])
-        same = np.flatnonzero(np.abs(tops - stop.z_mm) < SAME_Z_MM)
-        if not len(same):
+        turn = self.job.turn_at(now.line)
+        same = np.abs(tops[turn.first_layer : turn.end_layer] - stop.z_mm) < SAME_Z_MM
+        if not same.any():
             return None
-        return replace(stop, line=self.line(stop.line), layer_index=int(same[0]))
+        return replace(now, layer_index=turn.first_layer + int(np.argmax(same)))
 
     def anew(self, rest: Rest) -> Course:
         """After the job was written anew."""

@@ -63,9 +63,20 @@ class Stops:
 
     def __init__(self, job: Job, fixed: Sequence[Stop], pace: Pace | None) -> None:
         self._job, self._fixed, self._pace = job, list(fixed), pace
-        self._gap = pace.every if pace is not None else 0
-        # layers count from 0: the third is number 2
-        self._due = max(self._gap - 1, first_layer(job))
+        self._turns = job.turns
+        self._gap = self._due = 0
+        self._begin(0)
+
+    def _begin(self, turn: int) -> None:
+        """The first look at what a turn prints; its end is looked at in any case."""
+        every = self._pace.every if self._pace is not None else 0
+        self._gap, self._due = every, len(self._job.layers)
+        for one in self._turns[turn:]:
+            # layers count from 0: the third is number 2
+            due = max(one.first_layer + every - 1, first_layer(self._job.of_turn(one)))
+            if due < one.end_layer - 1:
+                self._due = due
+                return
 
     def next(self) -> Stop | None:
         """The next stop; None where there is none left."""
@@ -85,6 +96,9 @@ class Stops:
             return  # a fixed stop on the way: nothing new
         self._gap = self._pace.next_gap(self._gap, trouble=trouble)
         self._due = stop.layer_index + self._gap
+        turn = next(one for one in self._turns if stop.layer_index < one.end_layer)
+        if self._due >= turn.end_layer - 1:
+            self._begin(turn.index + 1)
 
 
 def had_trouble(looks: Sequence[Look]) -> bool:
@@ -92,8 +106,19 @@ def had_trouble(looks: Sequence[Look]) -> bool:
     return not looks or any(look.decision.action is not Action.GO_ON for look in looks)
 
 
+def layers_every(job: Job, every: int) -> list[int]:
+    """Every so many layers of what each turn prints, but for its last one; 0: none."""
+    if not every:
+        return []
+    return [
+        layer
+        for turn in job.turns
+        for layer in range(turn.first_layer + every - 1, turn.end_layer - 1, every)
+    ]
+
+
 def layers_at(job: Job, heights_mm: Sequence[float]) -> list[int]:
-    """The layers that reach given heights first.
+    """The layers that reach given heights first; of objects printed one after another, of each.
 
     Parameters
     ----------
@@ -106,12 +131,15 @@ def layers_at(job: Job, heights_mm: Sequence[float]) -> list[int]:
         If a height is not above the bed, or above the job's last layer.
     """
     tops = [layer.z_mm for layer in job.layers]
+    high_mm = max(tops[turn.end_layer - 1] for turn in job.turns)
     found = []
     for z_mm in heights_mm:
-        if not 0.0 < z_mm <= tops[-1] + 1e-6:
+        if not 0.0 < z_mm <= high_mm + 1e-6:
             raise InputError(
-                f"there is no layer at z = {z_mm:g} mm to stop after; the job is {tops[-1]:g} mm "
+                f"there is no layer at z = {z_mm:g} mm to stop after; the job is {high_mm:g} mm "
                 "high"
             )
-        found.append(next(k for k, top in enumerate(tops) if top >= z_mm - 1e-6))
+        for turn in job.turns:
+            own = range(turn.first_layer, turn.end_layer)
+            found += [k for k in own if tops[k] >= z_mm - 1e-6][:1]
     return found

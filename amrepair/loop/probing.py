@@ -18,7 +18,8 @@ from jaxtyping import Float
 from amrepair.arrays import Points, Values
 from amrepair.frames import Transform
 from amrepair.loop import travel
-from amrepair.loop.looks import Stop
+from amrepair.loop.in_turn import finished_at
+from amrepair.loop.looks import Stop, plan_stops
 from amrepair.loop.tape import FELT
 from amrepair.loop.touch_design import (
     USUAL_TOUCHES,
@@ -215,13 +216,17 @@ class ProbeScanner:
 
     def _stop(self, request: ScanRequest) -> Stop:
         layer = request.layer_index
-        line = self._job.footer_start_line if layer is None else self._job.layers[layer].end_line
-        return Stop(layer, line, request.z_mm)
+        if layer is not None:
+            return Stop(layer, self._job.layers[layer].end_line, request.z_mm)
+        ends = plan_stops(self._job, ())
+        return next((stop for stop in ends if stop.label == request.label), ends[-1])
 
     def _touched(self, stop: Stop, flats: Flats, standing: HeightField) -> tuple[Touches, int]:
         """All touches of a look, and how many they were."""
         most = self._options.most
-        _, rest = travel.park(self._setup, self._job.state_after(stop.line))
+        finished = finished_at(self._job, self._job.turn_at(stop.line), self._setup)
+        others = None if finished is None else finished.standing
+        _, rest = travel.park(self._setup, self._job.state_after(stop.line), others)
         self._progress(f"touch {stop.label}: the nozzle gets ready", 0.0, float(most))
         self._feeler.get_ready(rest)
         felt_mm = np.zeros((0, 3))

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from amrepair.arrays import Mask
 from amrepair.frames import Transform
+from amrepair.loop.in_turn import finished_at, laid_in, refuse_own_hits, template_of
 from amrepair.loop.locate import (
     BESIDE_THE_PART,
     MOVED_MM,
@@ -30,12 +31,12 @@ from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
-from amrepair.repair.site import Raft
+from amrepair.repair.site import Finished, Raft
 from amrepair.template import CutTemplate, KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import JobBridges
 from gcode.profiles import PrintSetup
-from gcode.reader import Beads, Job
+from gcode.reader import Beads, Job, Turn
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.surfaces import HeightField
@@ -58,7 +59,7 @@ class Expected:
     by_beads: bool
     detector: Detector
     _at: Callable[[Stop], Site]
-    _ends_otherwise: Callable[[], bool]
+    _ends_otherwise: Callable[[Turn], bool]
 
     def __call__(self, stop: Stop) -> Site:
         """At one stop."""
@@ -87,13 +88,23 @@ def sites(
     it is planned to be solid); else by the beads that the job planned, so that open infill is
     none of the defects; so is a finished part that the job leaves open at its top, as a vase, or
     whose walls it moves ('XY compensation', 'horizontal expansion').
+
+    Of objects that are printed one after another it is the one under way: what has come to its end
+    is judged there, and stands beside the others from then on (`Site.finished`).
+
+    Raises
+    ------
+    InputError
+        If the job itself leads the head through what it has finished.
     """
+    refuse_own_hits(job, setup)
 
     @functools.cache
-    def ends_otherwise() -> bool:
+    def ends_otherwise(turn: Turn) -> bool:
+        own, part = job.of_turn(turn), template_of(template, build_from_template, job, turn)
         return by_beads and (
-            _left_open(job, template, build_from_template)
-            or walls_moved_mm(job, template, build_from_template) > MOVED_MM
+            _left_open(own, part, build_from_template)
+            or walls_moved_mm(own, part, build_from_template) > MOVED_MM
         )
 
     return _expected(job, template, build_from_template, setup, by_beads, detector, ends_otherwise)
@@ -106,58 +117,117 @@ def _expected(
     setup: PrintSetup,
     by_beads: bool,
     detector: Detector,
-    ends_otherwise: Callable[[], bool],
+    ends_otherwise: Callable[[Turn], bool],
 ) -> Expected:
     """As `sites`; what the whole job ends with is asked once, whatever is left of it later."""
-    grid = LayerGrid.from_tops(tops_of(job), layer_height_mm=setup.process.layer_height_mm)
-    template_from_build = build_from_template.inverse()
     kept = KeptFills()
-    first, raft = first_layer(job), _raft(job, template, template_from_build)
-    towers = of_roles(job.beads, TOWERS)
+
+    @functools.cache
+    def of(turn: Turn) -> _Part:
+        return _Part.of(job, turn, template, build_from_template, setup, kept)
 
     def at(stop: Stop) -> Site:
-        if stop.layer_index is None and not ends_otherwise():
-            every = job.beads.layer >= 0
-            return Site(
-                template,
-                setup,
-                grid,
-                build_from_template,
-                calibration=NORMAL_NOISE,
-                lines=lines_of_job(job, every, setup),
-                beside=_beside(job, every),
-                raft=raft,
-                laid=_laid(job, every, kept),
-            )
+        part = of(job.turn_at(stop.line))
+        if stop.layer_index is None and not ends_otherwise(part.turn):
+            return part.finished_site()
+        return part.site_at(stop, by_beads=by_beads)
+
+    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_otherwise)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What one turn of a job prints: all of it, or one of the objects that it prints in turn.
+
+    Attributes
+    ----------
+    own
+        The job as if it printed nothing else.
+    job
+        All of it.
+    """
+
+    turn: Turn
+    own: Job
+    job: Job
+    template: Template
+    build_from_template: Transform
+    setup: PrintSetup
+    grid: LayerGrid
+    raft: Raft | None
+    finished: Finished | None
+    kept: KeptFills
+
+    @classmethod
+    def of(
+        cls,
+        job: Job,
+        turn: Turn,
+        template: Template,
+        placed: Transform,
+        setup: PrintSetup,
+        kept: KeptFills,
+    ) -> _Part:
+        own, part = job.of_turn(turn), template_of(template, placed, job, turn)
+        tops_mm = tops_of(job)[turn.first_layer : turn.end_layer]
+        grid = LayerGrid.from_tops(tops_mm, layer_height_mm=setup.process.layer_height_mm)
+        return cls(
+            turn, own, job, part, placed, setup, grid, _raft(own, part, placed.inverse()),
+            finished_at(job, turn, setup), kept,
+        )  # fmt: skip
+
+    def _beside(self, line: int, judged: Mask) -> HeightField | None:
+        """What is laid beside the part before a line, but for what of its own is judged."""
+        beads = self.job.beads
+        which = (beads.line < line) & (beads.layer >= 0)
+        which[laid_in(self.job, self.turn)] &= ~judged
+        return _beside(self.job, which)
+
+    def finished_site(self) -> Site:
+        """Judged by its template."""
+        every = self.own.beads.layer >= 0
+        return Site(
+            self.template,
+            self.setup,
+            self.grid,
+            self.build_from_template,
+            calibration=NORMAL_NOISE,
+            lines=lines_of_job(self.own, every, self.setup),
+            beside=self._beside(self.job.end_of(self.turn), np.zeros_like(every)),
+            raft=self.raft,
+            finished=self.finished,
+            laid=_laid(self.own, every, self.kept),
+        )
+
+    def site_at(self, stop: Stop, *, by_beads: bool) -> Site:
+        """Judged by what is printed so far."""
+        template_from_build, beads = self.build_from_template.inverse(), self.own.beads
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
-        beads = job.beads
         done = (beads.line < stop.line) & (beads.layer >= 0)
         # a tower stands as it does: nothing of it is to be mended
-        judged = done & (beads.layer >= first) & ~towers
+        judged = done & (beads.layer >= first_layer(self.own)) & ~of_roles(beads, TOWERS)
         start, end = (
             template_from_build.apply(place[judged]) for place in (beads.start_mm, beads.end_mm)
         )
         section, height = beads.section_mm2[judged], beads.height_mm[judged]
         planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
-        recent = PlannedBeads.recent(start, end, section, height)
-        below = CutTemplate(template, z_mm)
+        below = CutTemplate(self.template, z_mm)
         return Site(
             below,
-            setup,
-            grid,
-            build_from_template,
+            self.setup,
+            self.grid,
+            self.build_from_template,
             stop.z_mm,
             calibration=NORMAL_NOISE,
             planned=planned,
-            beads=recent,
-            lines=lines_of_job(job, done, setup),
+            beads=PlannedBeads.recent(start, end, section, height),
+            lines=lines_of_job(self.own, done, self.setup),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
-            beside=_beside(job, done & ~judged if by_beads else done),
-            raft=raft,
-            laid=_laid(job, done, kept),
+            beside=self._beside(stop.line, judged if by_beads else np.zeros_like(judged)),
+            raft=self.raft,
+            finished=self.finished,
+            laid=_laid(self.own, done, self.kept),
         )
-
-    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_otherwise)
 
 
 def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:

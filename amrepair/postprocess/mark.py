@@ -8,8 +8,9 @@ import numpy as np
 
 from amrepair.errors import InputError
 from amrepair.loop.marks import LOOK_MARK
-from amrepair.loop.pace import layers_at
+from amrepair.loop.pace import layers_at, layers_every
 from amrepair.postprocess.covering import covered_mm2
+from amrepair.postprocess.lifted import over_finished
 from amrepair.postprocess.places import Place, Places
 from amrepair.postprocess.words import Target, lines_of
 from gcode.errors import ReadError
@@ -120,7 +121,7 @@ def mark(text: str, name: str, target: Target, asked: LooksAsked) -> Marked:
     for place in chosen:
         out += lines[before : place.line]
         words = lines_of(target, place.layer, place.z_mm, asked.command)
-        out += [f"{line}{end}" for line in words]
+        out += [f"{line}{end}" for line in over_finished(job, place, words)]
         before = place.line
     out += lines[before:]
     return Marked(
@@ -134,21 +135,21 @@ def mark(text: str, name: str, target: Target, asked: LooksAsked) -> Marked:
 
 def _chosen(job: Job, places: Places, asked: LooksAsked) -> tuple[tuple[Place, ...], int]:
     """The looks in the job's order, and how many were moved to a later layer."""
-    count = len(job.layers)
     room = max(asked.every // 2, 1)
     wanted: dict[int, int] = {}  # layer: how many layers later it may be
-    if asked.every:
-        wanted |= dict.fromkeys(range(asked.every - 1, count - 1, asked.every), room)
+    wanted |= dict.fromkeys(layers_every(job, asked.every), room)
     if asked.adaptive:
         covers = covered_mm2(job)
         wanted |= dict.fromkeys((np.flatnonzero(covers[1:] >= asked.covers_mm2)).tolist(), 0)
     wanted |= dict.fromkeys(layers_at(job, asked.at_z_mm), 0)
+    ends = [turn.end_layer - 1 for turn in job.turns]
     if asked.final:
-        wanted[count - 1] = 0
+        wanted |= dict.fromkeys(ends, 0)
     found: dict[int, Place] = {}
     moved = 0
     for layer in sorted(wanted):
-        tried = [places.after(k) for k in range(layer, min(layer + wanted[layer], count - 1) + 1)]
+        end = next(last for last in ends if layer <= last)
+        tried = [places.after(k) for k in range(layer, min(layer + wanted[layer], end) + 1)]
         options = [place for place in tried if place is not None]
         good = [place for place in options if place.off_wall_mm >= places.width_mm]
         if options:

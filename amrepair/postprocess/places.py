@@ -56,7 +56,12 @@ class Places:
         self._first = np.searchsorted(beads.layer, np.arange(len(job.layers)), side="left")
         self._stop = np.searchsorted(beads.layer, np.arange(len(job.layers)), side="right")
         self._outer = of_roles(beads, OUTER_WALLS)
-        self._first_layer = first_layer(job)
+        self._first_layers = {
+            layer: first_layer(job.of_turn(turn))
+            for turn in job.turns
+            for layer in range(turn.first_layer, turn.end_layer)
+        }
+        self._ends = {turn.end_layer - 1 for turn in job.turns}
         self.width_mm = float(np.median(beads.width_mm))
 
     def is_spiral(self, layer: int) -> bool:
@@ -67,14 +72,16 @@ class Places:
         return rise_mm > SPIRAL_RATIO * max(self._job.layers[layer].height_mm, 1e-3)
 
     def after(self, layer: int) -> Place | None:
-        """The best place after a layer; None where there is none: a spiral, another object next."""
+        """The best place after a layer; None where there is none: in a spiral."""
         layers = self._job.layers
         last = int(self._job.beads.line[self._stop[layer] - 1])
-        if layer < self._first_layer or self.is_spiral(layer):
+        if layer < self._first_layers[layer] or self.is_spiral(layer):
             return None
         if layer + 1 == len(layers):
             return self._best(layer, last + 1, self._end_of_footer(last), (layer,))
-        if self.is_spiral(layer + 1) or layers[layer + 1].z_mm < layers[layer].z_mm:
+        if layer in self._ends:  # before another object begins
+            return self._best(layer, last + 1, layers[layer].end_line, (layer,))
+        if self.is_spiral(layer + 1):
             return None
         first = int(self._job.beads.line[self._first[layer + 1]])
         return self._best(layer, last + 1, first, (layer, layer + 1))

@@ -37,6 +37,22 @@ def is_cut(site: Site) -> bool:
     return site.planned is not None and is_off_bed(site.planned)
 
 
+def without_finished(scan: Scan, site: Site, template_from_scan: Transform) -> Scan:
+    """Without the objects of the job that have come to their end: they were judged then.
+
+    Parameters
+    ----------
+    scan
+        In any frame.
+    template_from_scan
+        Where it lies, to some millimetres: they are as far apart as the head is wide.
+    """
+    if site.finished is None or site.build_from_template is None:
+        return scan
+    placed = site.build_from_template @ template_from_scan
+    return scan.subset(~site.finished.own(placed.apply(scan.points_mm)[:, :2]))
+
+
 def of_the_part(scan: Scan, site: Site) -> Scan:
     """Without what the job laid beside the part."""
     aside = laid_aside(site)

@@ -13,7 +13,16 @@ import numpy as np
 from amrepair.align import align
 from amrepair.align.registration import Registration
 from amrepair.align.standing import refuse_impossible
-from amrepair.deficit import AsBuilt, Deficit, as_built_heights, compute_deficit, standing_in_job
+from amrepair.deficit import (
+    AsBuilt,
+    Deficit,
+    Standing,
+    as_built_heights,
+    compute_deficit,
+    raised_to_points,
+    standing_in_job,
+    with_others,
+)
 from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
@@ -23,7 +32,7 @@ from amrepair.repair import in_view
 from amrepair.repair.alike import registration_of_damage
 from amrepair.repair.filling import fillable, lines_of
 from amrepair.repair.plan import RepairPlan
-from amrepair.repair.site import Site
+from amrepair.repair.site import Finished, Site
 from amrepair.repair.stopwatch import Stopwatch
 from amrepair.scans import PROBE, Scan
 from gcode.check import JobBridges, check
@@ -102,6 +111,9 @@ def plan_repair(
         return plan
     with watch("deficit"):
         as_built = deficit.as_built  # made where it is needed: a clean layer has no use for it
+        if site.finished is not None:
+            as_built = _among_finished(as_built, laid, site.finished, site)
+            plan = replace(plan, deficit=replace(deficit, stands=Standing(lambda: as_built)))
     with watch("slice"):
         lines = lines_of(site, deficit, laid.placed)
         patch = _slice(missing, as_built, site, interruption, lines, progress)
@@ -175,7 +187,7 @@ def _align(
             registration = Registration.known(known)
         else:
             registration = align(
-                scan,
+                scan if guess is None else in_view.without_finished(scan, site, guess),
                 site.template,
                 guess=guess,
                 so_far=in_view.so_far(site),
@@ -191,11 +203,12 @@ def _align(
         refuse_impossible(site.template, placed, printer, said=said, raised=raised)
     moved = registration.template_from_scan
     whole = scan.moved(moved)
+    own = in_view.without_finished(whole, site, Transform.identity("template", "template"))
     return _Laid(
         registration,
         placed,
         whole,
-        in_view.of_layer(in_view.of_the_part(whole, site), site),
+        in_view.of_layer(in_view.of_the_part(own, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
         known is not None,
     )
@@ -274,6 +287,19 @@ def _deficit_options(site: Site) -> DeficitOptions:
         return options
     margin_mm = site.options.just_printed_margin_mm
     return replace(options, heights=replace(options.heights, unseen_margin_mm=margin_mm))
+
+
+def _among_finished(
+    as_built: HeightField, laid: _Laid, finished: Finished, site: Site
+) -> HeightField:
+    """What stands on the bed, and what else of the job does: as it was printed, and as it is seen.
+
+    Over all of it: the nozzle comes from beside the job, and goes back there.
+    """
+    points_mm = laid.placed.apply(laid.whole.points_mm)
+    own = points_mm[finished.own(points_mm[:, :2])]
+    others = raised_to_points(finished.standing, own, _deficit_options(site).heights)
+    return with_others(as_built, others)
 
 
 def _slice(

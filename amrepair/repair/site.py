@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align.registration import Registration
+from amrepair.arrays import ColumnMask, Mask
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY, PolicyOptions
@@ -42,6 +43,30 @@ class Raft:
 
     height_mm: float
     reach_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """Objects of a job that have come to their end, beside the one that is printed now.
+
+    Attributes
+    ----------
+    standing
+        How high they stand, build frame, on the whole reach of the nozzle.
+    theirs
+        (ny, nx) columns of it that are nearer to them than to the one that is printed now: what a
+        scan shows there is none of it.
+    """
+
+    standing: HeightField
+    theirs: ColumnMask
+
+    def own(self, xy_mm: Float[np.ndarray, "n 2"]) -> Mask:
+        """(n,) which places, build frame, are theirs."""
+        index = self.standing.cells_of(xy_mm)
+        inside = ((index >= 0) & (index < self.standing.shape)).all(axis=1)
+        index[~inside] = 0
+        return np.asarray(inside & self.theirs[index[:, 0], index[:, 1]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +112,9 @@ class Site:
         does not have them; −inf where nothing does. They are none of the part, nor too much.
     raft
         What a job lays under the part; None where it stands on the bed.
+    finished
+        Objects of the job that have come to their end; None where it prints all at once, or the
+        first of them.
     laid
         The job's beads so far, build frame: what its own path puts beyond what is expected
         (heights that are rounded up, plastic that has no room) is not too much.
@@ -121,6 +149,7 @@ class Site:
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
     raft: Raft | None = None
+    finished: Finished | None = None
     laid: LaidBeads | None = None
     detector: Detector = detect
     options: RepairOptions = USUAL_REPAIR
@@ -132,6 +161,11 @@ class Site:
     ) -> Site:
         """A finished part on the layers of the process profile."""
         return cls(template, setup, LayerGrid.from_setup(setup), build_from_template)
+
+    @property
+    def others(self) -> HeightField | None:
+        """What else of the job stands on the bed, build frame; None where nothing does."""
+        return None if self.finished is None else self.finished.standing
 
     @property
     def expected(self) -> Template:

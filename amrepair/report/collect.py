@@ -356,8 +356,9 @@ def decision_of(look: Look) -> ReportDecision:
 
 def look_label(look: Look) -> str:
     """`Layer 44, scan 3`, or `Finished part, scan 5`: scans are counted over the whole run."""
-    index = look.stop.layer_index
-    where = "Finished part" if index is None else f"Layer {index}"
+    index, number = look.stop.layer_index, look.stop.number
+    finished = "Finished part" if number is None else f"Finished object {number}"
+    where = finished if index is None else f"Layer {index}"
     return f"{where}, scan {look.number}"
 
 

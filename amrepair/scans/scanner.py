@@ -19,16 +19,20 @@ class ScanRequest:
     Attributes
     ----------
     label
-        Short name for files and messages: `layer-044`, `final`.
+        Short name for files and messages: `layer-044`, `final`, `final-2`.
     layer_index
         The layer just finished, or None for the finished part.
     z_mm
-        Height printed so far, build frame.
+        Height printed so far, build frame; of the object that is under way.
+    layers
+        How many layers of the job are printed where an object is finished and another one comes;
+        None elsewhere.
     """
 
     label: str
     layer_index: int | None
     z_mm: float
+    layers: int | None = None
 
 
 @runtime_checkable

@@ -203,11 +203,13 @@ class Stage:
     def _break(self, request: ScanRequest) -> None:
         """Let the defects of this stop happen, and take their measure."""
         printed = np.inf if request.layer_index is None else float(request.layer_index)
+        if request.layers is not None:  # of several objects one is finished
+            printed = request.layers - 1.0
         due = [
             d
             for d in self._defects
-            if d.last_layer == request.layer_index
-            or any(self._printed < layer <= printed for layer in d.layers)
+            if any(self._printed < layer <= printed for layer in d.layers)
+            or (d.last_layer == request.layer_index and self._can_happen(d))
         ]
         self._printed = printed
         for defect in due:
@@ -232,6 +234,14 @@ class Stage:
             else:
                 begun.label = request.label
                 begun.missing.append(own)
+
+    def _can_happen(self, defect: PlacedDefect) -> bool:
+        """Whether a part that it breaks stands there by now, and is whole yet."""
+        if any(wound.defect is defect for wound in self._wounds):
+            return False
+        down = np.where([[1, 1, 0], [1, 1, 1]], defect.box_mm, 0.0)  # to the bed
+        standing = self.reference.snapshot(self._window()).clipped(down)
+        return bool(len(defect.layers) or standing.volume_mm3 > 0.0)
 
     def _measure(self, label: str) -> None:
         """How much of this stop's missing volume is solid now, and how even its surface is."""

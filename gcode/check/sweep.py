@@ -88,11 +88,27 @@ def deepest_along(
     places_mm: Float[np.ndarray, "n 3"], printer: PrinterProfile, as_built: HeightField
 ) -> Float[np.ndarray, " n"]:
     """(n,) how deep the head is in what stands there, the tip at each place; ≤ 0: it is clear."""
-    nothing = np.zeros(len(places_mm))
-    tallest_mm, lowest_mm = as_built.top_mm, float(places_mm[:, 2].min())
+    return deepest_of_moves(places_mm, places_mm, printer, as_built)[0]
+
+
+def deepest_of_moves(
+    start_mm: Float[np.ndarray, "n 3"],
+    end_mm: Float[np.ndarray, "n 3"],
+    printer: PrinterProfile,
+    as_built: HeightField,
+) -> tuple[Float[np.ndarray, " n"], tuple[EnvelopeSlice, ...]]:
+    """(n,) how deep the head comes into what stands there on each move, and which of its parts.
+
+    Beyond what is allowed; ≤ 0: it is clear. What the moves themselves lay is not asked about.
+    """
+    tallest_mm = as_built.top_mm
+    lowest_mm = float(min(start_mm[:, 2].min(), end_mm[:, 2].min()))
     slices = [p for p in printer.head if p.z_from_mm <= tallest_mm - lowest_mm]
-    found = _Swept(places_mm, places_mm, nothing, nothing).over(as_built, slices, grows=False)
-    return np.full(len(places_mm), -np.inf) if found is None else found[0]
+    nothing = np.zeros(len(start_mm))
+    found = _Swept(start_mm, end_mm, nothing, nothing).over(as_built, slices, grows=False)
+    if found is None:
+        return np.full(len(start_mm), -np.inf), (printer.head[0],) * len(start_mm)
+    return found[0], tuple(slices[int(k)] for k in found[1])
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ comments of PrusaSlicer, SuperSlicer, OrcaSlicer, Bambu Studio, Cura and ideaMak
 nothing; `check` does, with a parser of its own.
 """
 
-from gcode.reader.job import Beads, Job, job_for, read_job
+from gcode.reader.job import Beads, Job, Turn, job_for, read_job
 from gcode.reader.objects import JobObjects, objects_of
 
-__all__ = ["Beads", "Job", "JobObjects", "job_for", "objects_of", "read_job"]
+__all__ = ["Beads", "Job", "JobObjects", "Turn", "job_for", "objects_of", "read_job"]

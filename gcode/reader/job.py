@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import re
 from bisect import bisect_right
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from statistics import median
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
@@ -29,6 +30,7 @@ _WIDTH = re.compile(r"(?:WIDTH|LINE_WIDTH):\s*" + _JOB_NUMBER)
 # ("'Perimeter Path', 12.0 [feed mm/s]").
 _ROLE = re.compile(r"(?:TYPE|FEATURE):\s*(.+?)\s*$|^\W*feature (\w.*?)\s*$|^\W*'([\w/ ]+ Path)',")
 _LEAST_LAYER_MM = 0.015
+ROUNDED_Z_MM = 1e-4  # jobs are written to a thousandth of a millimetre
 _SQUARE_LOSS = 1.0 - math.pi / 4.0
 UNKNOWN_ROLE = "unknown"
 NOTHING_LAID = "The program extrudes nothing; it is no print job."
@@ -47,6 +49,20 @@ class JobLayer:
     index: int
     z_mm: float
     height_mm: float
+    first_line: int
+    end_line: int
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """Layers [first_layer, end_layer) one above the other, on lines [first_line, end_line).
+
+    A job that prints its objects one after another has one for each; any other has one.
+    """
+
+    index: int
+    first_layer: int
+    end_layer: int
     first_line: int
     end_line: int
 
@@ -82,6 +98,11 @@ class Beads:
     def __len__(self) -> int:
         return len(self.line)
 
+    def subset(self, pick: Bool[np.ndarray, " n"]) -> Beads:
+        """Some of them, in their order."""
+        per_bead = (f.name for f in fields(self) if f.name != "roles")
+        return replace(self, **{name: getattr(self, name)[pick] for name in per_bead})
+
     @property
     def volume_mm3(self) -> float:
         """Plastic in all beads."""
@@ -114,6 +135,27 @@ class Job:
     ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """By program line, as `Block.moves`."""
         return self.block.moves()
+
+    @property
+    def turns(self) -> tuple[Turn, ...]:
+        """In which the job prints what it prints: one, or one for each object after another."""
+        return turns_of(self.layers)
+
+    def turn_at(self, line: int) -> Turn:
+        """The turn that is under way, or has just come to its end, before a line."""
+        turns = self.turns
+        begun = bisect_right([turn.first_line for turn in turns], line - 1)
+        return turns[max(begun - 1, 0)]
+
+    def end_of(self, turn: Turn) -> int:
+        """The line after the last bead of a turn."""
+        return int(self.beads.line[np.searchsorted(self.beads.layer, turn.end_layer) - 1]) + 1
+
+    def of_turn(self, turn: Turn) -> Job:
+        """The same, as if nothing but what one turn lays were laid; its layers keep their index."""
+        layer = self.beads.layer
+        own = (layer >= turn.first_layer) & (layer < turn.end_layer)
+        return self if own.all() else replace(self, beads=self.beads.subset(own))
 
     @property
     def tools(self) -> Int[np.ndarray, " m1"]:
@@ -283,6 +325,24 @@ def _with_heights(layers: list[JobLayer], comments: list[tuple[int, str]]) -> tu
             height_mm = layers[0].height_mm if layer.z_mm <= layers[0].z_mm else usual_mm
         out.append(JobLayer(layer.index, layer.z_mm, height_mm, layer.first_line, layer.end_line))
     return tuple(out)
+
+
+def turns_of(layers: Sequence[JobLayer]) -> tuple[Turn, ...]:
+    """Layers by the turns that they belong to.
+
+    A new one begins where a layer is laid at least a layer lower than the one before. Less is a
+    first layer over a raft, that the next one presses down.
+    """
+    firsts = [0]
+    for before, after in pairwise(layers):
+        height_mm = max(before.height_mm, after.height_mm)
+        if before.z_mm - after.z_mm > height_mm - ROUNDED_Z_MM:
+            firsts.append(after.index)
+    ends = [*firsts[1:], len(layers)]
+    return tuple(
+        Turn(k, first, end, layers[first].first_line if k else 0, layers[end - 1].end_line)
+        for k, (first, end) in enumerate(zip(firsts, ends, strict=True))
+    )
 
 
 def mark_of(comment: str) -> str | None:

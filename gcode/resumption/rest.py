@@ -264,8 +264,4 @@ class _Pen:
 def without_beads(job: Job, objects: JobObjects, names: Sequence[str], first: int) -> Job:
     """The same job, as far as what it lays is asked for: of some objects nothing from a line on."""
     gone = objects.own(names)
-    keep = ~(gone & (job.beads.line >= first))
-    beads = job.beads
-    per_bead = ("start_mm", "end_mm", "section_mm2", "width_mm", "height_mm", "role", "layer",
-                "line")  # fmt: skip
-    return replace(job, beads=replace(beads, **{n: getattr(beads, n)[keep] for n in per_bead}))
+    return replace(job, beads=job.beads.subset(~(gone & (job.beads.line >= first))))

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from loop_bench import solid_mesh
 
 from amrepair.deficit import compute_deficit
-from amrepair.errors import AlignmentError, InputError
+from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.loop.locate import (
     first_layer,
@@ -304,15 +304,6 @@ def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much() -> None:
         assert much.label is Label.EXCESS
         # half a cell's width of the ridges around it, 0.18 mm high, hangs together with it
         assert much.volume_mm3 == pytest.approx(16.0 * (5.6 - 5.12), rel=0.12)
-
-
-def test_a_job_that_prints_one_object_after_the_other_is_refused_in_a_sentence() -> None:
-    """It was "The tops of layers must ascend from above 0 mm.", after the part had been found."""
-    job = job_of(wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0)))
-    again = [replace(layer, index=len(job.layers) + layer.index) for layer in job.layers]
-    template = MeshSdf.from_mesh(solid_mesh(wedge()))
-    with pytest.raises(InputError, match=r"layer 30 is laid at 0.2 mm after one at 6 mm"):
-        locate_parts(replace(job, layers=(*job.layers, *again)), template, layer_height_mm=LAYER_MM)
 
 
 def test_a_first_layer_over_a_gap_is_pressed_down_by_the_next() -> None:

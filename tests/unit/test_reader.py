@@ -142,3 +142,28 @@ def test_blocks_are_what_the_whole_is(chars: int) -> None:
 def test_roles_are_read_as_each_slicer_names_them(mark: str, role: str) -> None:
     text = f"M83\nG1 X0 Y0 Z0.2 F600\n{mark}\nG1 X20 E1\n"
     assert read_job(text).beads.roles[-1] == role
+
+
+@pytest.mark.parametrize(
+    ("tops_mm", "turns"),
+    [
+        ([0.2, 0.4, 0.6, 0.2, 0.4, 0.6], [(0, 3), (3, 6)]),
+        ([0.2, 0.4, 0.2, 0.4], [(0, 2), (2, 4)]),  # of two layers each
+        ([0.2, 0.2, 0.2], [(0, 3)]),  # of one: nothing is higher than anything
+        ([0.3, 0.2, 0.4], [(0, 3)]),  # a line to prime with, above the first layer
+        ([0.3, 0.45, 0.65, 1.15, 1.13, 1.33], [(0, 6)]),  # Cura's gap over a raft
+    ],
+)
+def test_a_turn_begins_where_a_layer_is_laid_a_layer_lower(
+    tops_mm: list[float], turns: list[tuple[int, int]]
+) -> None:
+    lines = ["G28", "G90", "M83"]
+    for z_mm in tops_mm:
+        lines += [";LAYER_CHANGE", f"G1 X20 Y20 Z{z_mm} F6000", "G1 X60 E2 F1200"]
+    job = read_job("\n".join(lines) + "\n")
+    assert [(turn.first_layer, turn.end_layer) for turn in job.turns] == turns
+    for turn in job.turns:
+        own = job.of_turn(turn).beads
+        assert set(own.layer.tolist()) == set(range(turn.first_layer, turn.end_layer))
+        assert job.end_of(turn) == own.line[-1] + 1
+        assert job.turn_at(job.end_of(turn)) == turn
