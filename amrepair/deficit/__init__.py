@@ -4,7 +4,7 @@ It turns a detected difference into geometry with a tolerance; it does not decid
 """
 
 from amrepair.deficit.compute import AsBuilt, Deficit, Standing, compute_deficit, measured_regions
-from amrepair.deficit.heights import as_built_heights, raised_to_points, with_others
+from amrepair.deficit.heights import as_built_heights, with_others, with_what_stands_out
 from amrepair.deficit.line_heights import standing_in_job
 
 __all__ = [
@@ -14,7 +14,7 @@ __all__ = [
     "as_built_heights",
     "compute_deficit",
     "measured_regions",
-    "raised_to_points",
     "standing_in_job",
     "with_others",
+    "with_what_stands_out",
 ]

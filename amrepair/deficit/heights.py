@@ -239,14 +239,6 @@ def with_what_stands_out(
     return field.raised(z_mm)
 
 
-def raised_to_points(
-    field: HeightField, points_mm: Points, options: HeightOptions = USUAL_DEFICIT.heights
-) -> HeightField:
-    """As high as the topmost surface that points, build frame, show in each cell, or higher."""
-    top_mm, seen = _tops(points_mm, field, options)
-    return field.raised(np.where(seen, top_mm, -np.inf))
-
-
 def with_others(field: HeightField, others: HeightField) -> HeightField:
     """A field, and what stands in another one far beside it: one field over both, in its cells."""
     rows, columns = np.nonzero(others.z_mm > 0.0)

@@ -28,7 +28,7 @@ from gcode.reader import Job, Turn
 from gcode.reader.objects import box_of_beads_mm
 from gcode.resumption.standing import standing_field
 
-LEAST_SHARE = 0.5  # of what a copy, or a body, covers of the bed: then the turn is its own
+LEAST_SHARE = 0.5  # of what a copy, a body, or a turn covers of the bed: then the place is one
 
 
 def finished_at(job: Job, turn: Turn, setup: PrintSetup) -> Finished | None:
@@ -42,7 +42,7 @@ def finished_at(job: Job, turn: Turn, setup: PrintSetup) -> Finished | None:
         standing_field(beads.subset(parts & pick), job.program.text.count("\n"), machine).z_mm > 0
         for pick in (beads.layer < turn.first_layer, laid_in(job, turn))
     )
-    if (theirs & own).any():
+    if (theirs & own).sum() > LEAST_SHARE * own.sum():
         raise InputError(
             f"the job lays layer {turn.first_layer} at {job.layers[turn.first_layer].z_mm:g} mm "
             "where something higher stands already; it prints neither layer by layer nor one "

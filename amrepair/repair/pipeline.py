@@ -19,9 +19,9 @@ from amrepair.deficit import (
     Standing,
     as_built_heights,
     compute_deficit,
-    raised_to_points,
     standing_in_job,
     with_others,
+    with_what_stands_out,
 )
 from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform
@@ -112,7 +112,7 @@ def plan_repair(
     with watch("deficit"):
         as_built = deficit.as_built  # made where it is needed: a clean layer has no use for it
         if site.finished is not None:
-            as_built = _among_finished(as_built, laid, site.finished, site)
+            as_built = _among_finished(as_built, laid, anomaly, site.finished, site)
             plan = replace(plan, deficit=replace(deficit, stands=Standing(lambda: as_built)))
     with watch("slice"):
         lines = lines_of(site, deficit, laid.placed)
@@ -290,15 +290,21 @@ def _deficit_options(site: Site) -> DeficitOptions:
 
 
 def _among_finished(
-    as_built: HeightField, laid: _Laid, finished: Finished, site: Site
+    as_built: HeightField, laid: _Laid, anomaly: AnomalyMap, finished: Finished, site: Site
 ) -> HeightField:
     """What stands on the bed, and what else of the job does: as it was printed, and as it is seen.
 
     Over all of it: the nozzle comes from beside the job, and goes back there.
     """
+    assert anomaly.evidence is not None
     points_mm = laid.placed.apply(laid.whole.points_mm)
-    own = points_mm[finished.own(points_mm[:, :2])]
-    others = raised_to_points(finished.standing, own, _deficit_options(site).heights)
+    others = with_what_stands_out(
+        finished.standing,
+        points_mm[finished.own(points_mm[:, :2])],
+        laid.whole.sigma_mm,
+        anomaly.evidence.spacing_mm,
+        site.options.deficit.heights,
+    )
     return with_others(as_built, others)
 
 

@@ -461,7 +461,8 @@ def deposit(world, head, path, window, state):
         if not chained:
             state[HELD] = 0.0
             state[RUN_LENGTH] = 0.0
-        if not chained and state[CARRY] > 0.0:
+        # what rounding leaves of it stays at the nozzle: after a travel it would hang in the air
+        if not chained and state[CARRY] > LEAST_COLUMN_MM:
             pool, pool_next = grown(pool, pool_next, meta, nodes)
             world = StandingColumns(Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp)
             if s == 0:  # of the strand before nothing is known

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from amrepair.errors import InputError
+from amrepair.simulate.deposit_kernels import CARRY
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
 from tests.worlds import missing_versus
@@ -250,3 +251,15 @@ def test_truth_counts_only_what_was_missing_as_filled() -> None:
 def test_columns_wider_than_the_limit_are_refused() -> None:
     with pytest.raises(InputError, match=r"0\.15"):
         World((60.0, 60.0), cell_mm=0.2)
+
+
+def test_what_rounding_leaves_at_the_nozzle_does_not_hang_in_the_air_after_a_travel() -> None:
+    """Eight columns, a film of nothing 5 mm up, kept the head off a whole object for good."""
+    world = World((40.0, 40.0))
+    world.deposit(block((5.0, 5.0), 12, 2))
+    world._state[CARRY] = 1e-12
+    nozzle = Nozzle()
+    for place in ((6.5, 6.2, 0.4), (30.0, 30.0, 8.0), (30.0, 30.0, 0.2)):
+        nozzle.go(*place)
+    world.deposit(nozzle.batch())
+    assert world.top().top_mm < 1.0
