@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import manifold3d as m3
 import numpy as np
-from loop_bench import scan_of, solid_mesh
+import trimesh
+from loop_bench import solid_mesh
 
 from amrepair.frames import Transform
 from amrepair.loop.locate import stood
@@ -22,6 +23,7 @@ from gcode.profiles import PrintSetup, load_setup
 from gcode.reader import Job, job_for
 
 LAYER_MM, LINE_MM, FILAMENT_MM2 = 0.2, 0.45, np.pi * 1.75**2 / 4
+POINTS_MM2 = 16.0
 HEAD = "M140 S60\nM190 S60\nM104 S215\nM109 S215\nG28\nG90\nM83\nG92 E0\nG1 Z5 F600\n"
 SETUP = load_setup("prusa_mk3s", "pla", "repair_0.20")
 
@@ -111,8 +113,12 @@ class InTurn:
 
 
 def seen(solid: m3.Manifold, seed: int) -> Scan:
-    """A scan in the bed's frame."""
-    return replace(scan_of(solid, seed), frame="scanner")
+    """A cloud of all that stands there, as dense on each as one of a part alone."""
+    mesh, rng = solid_mesh(solid), np.random.default_rng(seed)
+    points, faces = trimesh.sample.sample_surface(mesh, int(POINTS_MM2 * mesh.area), seed=seed)
+    noisy = np.asarray(points) + rng.normal(scale=0.02, size=points.shape)
+    normals = np.asarray(mesh.face_normals)[faces].astype(np.float32).astype(np.float64)
+    return Scan(noisy, 0.02, "scanner", normals)
 
 
 def copies(size_mm: tuple[float, float, float], at_mm: list[tuple[float, float]]) -> InTurn:
