@@ -6,6 +6,11 @@ compiled, with wrong results and no error. Here every process names its files it
 is compiled again when any of the kernels has changed: it may have another one's code in its own.
 Of processes that start together on a new machine one compiles a kernel, and the others wait.
 
+numba makes some of its own functions (those within a sort, say) anew for each kernel, of one name
+for different work, and tells them apart by counting, in each process from one on. Of two kernels on
+disk that two processes had compiled, the one that was loaded first lent the other its own, and a
+sort of indices crashed. Here each process counts from a place of its own.
+
 A kernel that may add up in any order (`fastmath`) and is called by another is inlined there
 (`inline="always"`). Else the process that compiles both uses the code that stands alone, and a
 process that loads the caller from disk the caller's copy, which adds up in another order: the same
@@ -28,6 +33,7 @@ from __future__ import annotations
 import functools
 import gc
 import importlib
+import itertools
 import os
 import secrets
 import time
@@ -41,7 +47,7 @@ import numba
 import numba.np.linalg
 import numpy as np
 from numba import get_num_threads, prange, set_num_threads, types
-from numba.core import event
+from numba.core import bytecode, event
 from numba.core.runtime import nrt, nrtdynmod
 from numba.extending import overload
 from numba.np import arrayobj
@@ -57,6 +63,8 @@ OWN_OPTIONS: dict[str, Any] = {"fastmath": False, "error_model": "python"}
 # The slowest kernel takes six seconds alone, with all that it calls eleven.
 LONGEST_COMPILE_S = 60.0
 COMPILE_POLL_S = 0.02
+# What a process makes while it compiles all kernels is some ten thousand functions.
+_PLACE_BITS, _COUNT_BITS = 40, 20
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
@@ -147,6 +155,16 @@ class _WithoutCollector(event.Listener):
             gc.enable()
 
 
+def count_from_own_place() -> None:
+    """Number what numba makes in this process as no other process does, nor its parent."""
+    if hasattr(bytecode.FunctionIdentity, "_unique_ids"):
+        own = secrets.randbits(_PLACE_BITS) << _COUNT_BITS
+        bytecode.FunctionIdentity._unique_ids = itertools.count(own + 1)
+
+
+count_from_own_place()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=count_from_own_place)
 without_scipy()
 runtime_when_asked()
 _without_collector = _WithoutCollector()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import gc
 import os
+import re
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -62,6 +63,55 @@ def test_two_processes_that_compile_at_once_load_what_each_compiled(
     assert alone == "code for contiguous arrays"
     ours = loaded_after_a_race(tmp_path / "b", monkeypatch, safely=True)
     assert ours == "code for strided arrays"
+
+
+SORTED = """
+import numpy as np
+from numba.core.bytecode import FunctionIdentity
+from gcode.compiled import njit
+
+for _ in range({skip}):
+    next(FunctionIdentity._unique_ids)
+
+@njit(cache=True)
+def kernel(values):
+    return np.{function}(values)
+"""
+PARTS = re.compile(rb"13run_quicksortB\d+v(\d+)B")
+
+
+def test_kernels_that_two_processes_compiled_do_not_mix_their_parts(tmp_path: Path) -> None:
+    """regression: a tree of triangles crashed where another process had compiled another sort."""
+    outside = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+
+    def said(text: str) -> str:
+        return subprocess.run(
+            [sys.executable, "-c", f"import numpy as np\n{text}"],
+            env=outside, capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+
+    def numbered(name: str, function: str, skip: int = 0) -> int:
+        """By which number numba knows the sort's parts once a kernel is compiled, in a process."""
+        for old in tmp_path.glob(f"__pycache__/{name}*"):
+            old.unlink()
+        (tmp_path / f"{name}.py").write_text(SORTED.format(function=function, skip=skip))
+        said(f"import {name}; {name}.kernel(np.array([0.3, 0.1, 0.2]))")
+        (code,) = tmp_path.glob(f"__pycache__/{name}.kernel*.nbc")
+        found = PARTS.search(code.read_bytes())
+        assert found is not None
+        return int(found[1])
+
+    apart = numbered("sorts", "sort") - numbered("orders", "argsort")
+    if 0 <= apart < 100:  # else they are no neighbours, as it is to be
+        numbered("orders", "argsort", apart)
+    found = said(
+        "import sorts, orders, gcode.compiled\n"
+        "values = np.array([0.3, 0.1, 0.2])\n"
+        "print(sorts.kernel(values).tolist(), orders.kernel(values).tolist(),"
+        " gcode.compiled.all_from_disk())"
+    )
+    assert found == "[0.1, 0.2, 0.3] [1, 2, 0] True\n"
+    assert abs(apart) > 100
 
 
 class Record:
