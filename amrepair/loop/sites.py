@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from amrepair.arrays import Mask
+from amrepair.arrays import Mask, Points
 from amrepair.frames import Transform
 from amrepair.loop.in_turn import finished_at, laid_in, refuse_own_hits, template_of
 from amrepair.loop.locate import (
@@ -31,6 +31,7 @@ from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair import Detector, Site
+from amrepair.repair.options import USUAL_REPAIR
 from amrepair.repair.site import Finished, Raft
 from amrepair.template import CutTemplate, KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
@@ -42,8 +43,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.surfaces import HeightField
 from gcode.surfaces.lines import columns_around, heights_by_lines
 
-# Around what the job lays beside the part: strands spread, and stringy ones stray.
-STRINGS_MM, BESIDE_CELL_MM = 0.4, 0.25
+BESIDE_CELL_MM = 0.25
 # Lower than the drawing by more, a place is open: slopes and rounding make one.
 LEFT_OPEN_LAYERS = 2.0
 RIMS = ("perimeter", "wall")  # what slicers call it
@@ -210,7 +210,13 @@ class _Part:
             template_from_build.apply(place[judged]) for place in (beads.start_mm, beads.end_mm)
         )
         section, height = beads.section_mm2[judged], beads.height_mm[judged]
-        planned = PlannedSdf.from_beads(start, end, section, height) if by_beads else None
+        support = of_roles(beads, BESIDE_THE_PART)
+        level_mm = _highest_mm(start, end, ~support[judged])
+        planned = (
+            PlannedSdf.from_beads(start, end, section, height, level_mm=level_mm)
+            if by_beads
+            else None
+        )
         below = CutTemplate(self.template, z_mm)
         return Site(
             below,
@@ -224,10 +230,17 @@ class _Part:
             lines=lines_of_job(self.own, done, self.setup),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=self._beside(stop.line, judged if by_beads else np.zeros_like(judged)),
+            strands=_beside(self.own, judged & support) if by_beads else None,
             raft=self.raft,
             finished=self.finished,
             laid=_laid(self.own, done, self.kept),
         )
+
+
+def _highest_mm(start: Points, end: Points, pick: Mask) -> float | None:
+    """How high some beads come; None where there are none."""
+    tops_mm = np.maximum(start[pick, 2], end[pick, 2])
+    return float(tops_mm.max()) if len(tops_mm) else None
 
 
 def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:
@@ -251,7 +264,9 @@ def _left_open(job: Job, template: Template, build_from_template: Transform) -> 
     beads = job.beads
     solid: Any = template.solid()
     part = HeightField.from_manifold(
-        solid.transform(build_from_template.matrix[:3]), BESIDE_CELL_MM, margin_mm=STRINGS_MM
+        solid.transform(build_from_template.matrix[:3]),
+        BESIDE_CELL_MM,
+        margin_mm=USUAL_REPAIR.stray_mm,
     )
     pick = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
     half_mm = half_widths_mm(beads, pick)
@@ -279,7 +294,7 @@ def _beside(job: Job, which: Mask) -> HeightField | None:
     pick = which & of_roles(beads, BESIDE_THE_PART)
     if not pick.any():
         return None
-    within_mm = half_widths_mm(beads, pick) + STRINGS_MM
+    within_mm = half_widths_mm(beads, pick) + USUAL_REPAIR.stray_mm
     low, shape = columns_around(
         beads.start_mm[pick], beads.end_mm[pick], float(within_mm.max()), BESIDE_CELL_MM
     )

@@ -97,26 +97,32 @@ def told_to_go_beyond(site: Site, placed: Transform) -> RoundedUp | None:
     """How far out the job itself goes, as `detect` asks it; with no more than it needs."""
     if site.laid is None:
         return None
-    return partial(_laid_beyond, site.laid, site.expected, 0.5 * site.allowance_mm, placed)
+    return partial(_laid_beyond, site, site.laid, placed)
 
 
 def _laid_beyond(
+    site: Site,
     laid: LaidBeads,
-    expected: Template,
-    least_mm: float,
     placed: Transform,
     place_mm: Float[np.ndarray, "s 3"],
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
     """(s,) how far out of what is expected the job's own path may put each place."""
     beyond_mm = np.zeros(len(place_mm))
-    some = np.flatnonzero(deviation_mm > least_mm)
+    some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
     if len(some):
-        normal = unit_vectors(expected.distance_and_gradient(place_mm[some])[1])
+        normal = unit_vectors(site.expected.distance_and_gradient(place_mm[some])[1])
+        in_build = placed.apply(place_mm[some])
         offset_mm, tolerance_mm = laid.expected_offset_mm(
-            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
+            in_build, placed.rotate(normal), deviation_mm[some]
         )
         beyond_mm[some] = offset_mm + tolerance_mm
+        if site.strands is not None:
+            top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
+            strand = in_build[:, 2] < top_mm + site.options.over_beside_mm
+            beyond_mm[some] = np.where(
+                strand, np.maximum(beyond_mm[some], site.options.stray_mm), beyond_mm[some]
+            )
     return np.maximum(beyond_mm, 0.0)
 
 

@@ -21,6 +21,8 @@ class RepairOptions:
     off_the_part_mm, over_beside_mm, on_bed_mm
         What lies beside the part: so far off it, no higher than it was to be by this much, and
         higher than what is taken for the bed.
+    stray_mm
+        Strands of supports spread and stray by so much; skirts and towers, too.
     just_printed_margin_mm
         What is added, where nobody saw it, to the height that a job has just printed to: no sensor
         sees into a deep cell of infill, or behind a wall, and the head has just been there.
@@ -38,6 +40,7 @@ class RepairOptions:
     off_the_part_mm: float = 0.3
     over_beside_mm: float = 0.3
     on_bed_mm: float = 0.2
+    stray_mm: float = 0.4
     just_printed_margin_mm: float = 0.0
     upright: float = 1e-7
     same_repair_ratio: float = 0.8

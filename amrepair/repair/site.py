@@ -110,6 +110,9 @@ class Site:
     beside
         How high skirt, brim and supports stand beside the part, build frame, where the template
         does not have them; −inf where nothing does. They are none of the part, nor too much.
+    strands
+        How high supports stand that are planned, too, and strands may stray, build frame: they are
+        judged, but by as much as they may stray nothing there is too much.
     raft
         What a job lays under the part; None where it stands on the bed.
     finished
@@ -148,6 +151,7 @@ class Site:
     lines: JobLines | None = None
     surface: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]] | None = None
     beside: HeightField | None = None
+    strands: HeightField | None = None
     raft: Raft | None = None
     finished: Finished | None = None
     laid: LaidBeads | None = None

@@ -50,6 +50,7 @@ class PlannedSdf:
         section_mm2: Values,
         height_mm: Values,
         *,
+        level_mm: float | None = None,
         options: PlannedOptions = USUAL_PLANNED,
     ) -> PlannedSdf:
         """Make the field of beads.
@@ -60,6 +61,9 @@ class PlannedSdf:
             (n, 3) nozzle positions; a bead hangs below them by its height.
         section_mm2, height_mm
             (n,) its plastic and its height: as wide as their ratio.
+        level_mm
+            A height on which faces of voxels lie; the highest bead's by default. Supports may have
+            layers of their own, which end between two of the part's.
 
         Raises
         ------
@@ -79,11 +83,13 @@ class PlannedSdf:
         low[2] = (np.minimum(start[:, 2], end[:, 2]) - height).min()
         high = np.maximum(start, end).max(axis=0) + np.array([reach, reach, 0.0])
         # The voxels are placed so that faces of theirs lie on the last layer's top.
-        levels = int(np.ceil((top_mm - low[2]) / voxel_mm - 1e-6))
+        level_mm = top_mm if level_mm is None else level_mm
+        face_mm = level_mm + voxel_mm * np.ceil((top_mm - level_mm) / voxel_mm - 1e-6)
+        levels = int(np.ceil((face_mm - low[2]) / voxel_mm - 1e-6))
         margin_mm = options.margin_mm
         above = int(np.ceil(margin_mm / voxel_mm))
         below = int(np.ceil(options.below_beads_mm / voxel_mm))
-        foot_mm = top_mm - levels * voxel_mm
+        foot_mm = face_mm - levels * voxel_mm
         origin = np.array([low[0] - margin_mm, low[1] - margin_mm, foot_mm - below * voxel_mm])
         size = np.ceil((high[:2] + margin_mm - origin[:2]) / voxel_mm).astype(int)
         shape = (int(size[0]), int(size[1]), below + levels + above)

@@ -11,7 +11,7 @@ from loop_bench import solid_mesh
 from amrepair.frames import Transform
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.sites import sites
-from amrepair.repair import RepairPlan, plan_repair
+from amrepair.repair import RepairPlan, in_view, plan_repair
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.profiles import load_setup
@@ -82,3 +82,43 @@ def test_a_tower_is_nothing_to_be_mended() -> None:
     assert site.beside is not None
     assert site.planned.bounds_mm[1, 0] < 130.0 < start[tower, 0].min()
     assert site.beside.box_mm[0] > 130.0
+
+
+def supported() -> Job:
+    """The block's job up to layer 10, then a layer of a support of its own height beside it."""
+    job = job_of(BLOCK)
+    last = np.flatnonzero(job.beads.layer == 10)
+    moved = last[::3]
+    roles = (*job.beads.roles, "Support material")
+    role = job.beads.role.copy()
+    role[moved] = len(roles) - 1
+    start, end = job.beads.start_mm.copy(), job.beads.end_mm.copy()
+    for place in (start, end):
+        place[moved] += [22.0, 0.0, 0.09]
+    return replace(
+        job, beads=replace(job.beads, role=role, roles=roles, start_mm=start, end_mm=end)
+    )
+
+
+def test_a_part_is_as_high_as_its_own_layer_and_not_as_its_support_s() -> None:
+    """regression: 0.09 mm of all tops were missing where a support's layer ends between two."""
+    job = supported()
+    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
+    site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
+    assert site.planned is not None
+    top_mm = job.layers[10].z_mm
+    places = np.array([[x, y, top_mm] for x in (95.0, 100.0, 105.0) for y in (94.0, 100.0)])
+    assert abs(site.planned.distance(places)).max() < 0.03
+
+
+def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
+    job = supported()
+    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
+    site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
+    beyond = in_view.told_to_go_beyond(site, here)
+    assert beyond is not None
+    support = job.beads.role == len(job.beads.roles) - 1
+    middle = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support] - [0.0, 0.0, 0.1]
+    of_part = np.array([[100.0, 89.8, 1.5]])
+    assert (beyond(middle, np.full(len(middle), 0.3)) >= 0.4).all()
+    assert (beyond(of_part, np.array([0.3])) < 0.2).all()
