@@ -33,8 +33,17 @@ class Dialect:
         Other dialects whose jobs it understands.
     mesh_again
         Command for a mesh of the bed that homing switches off; empty where it stays on.
+    tool_zeroes_e
+        Another head's E begins at 0.
+    names_heaters
+        Heads and heaters are told by names, too.
+    head_off
+        Line that switches the heater of head `{k}` off, whichever is chosen.
+    head_heats
+        Lines that heat head `{k}`, which is not chosen, to `{c}`, °C, and that wait for it.
     wait_to_cool
-        Lines that wait until the hotend, which is off, is as cold as `{c}`, °C.
+        Lines that wait until the hotend, which is off, is as cold as `{c}`, °C; `{sensor}` is its
+        heater's name.
     """
 
     name: str
@@ -43,6 +52,10 @@ class Dialect:
     g91_moves_e: bool = False
     reads: frozenset[str] = frozenset()
     mesh_again: str = ""
+    tool_zeroes_e: bool = False
+    names_heaters: bool = False
+    head_off: str = "M104 T{k} S0"
+    head_heats: tuple[str, ...] = ("M104 T{k} S{c}", "M109 T{k} S{c}")
     wait_to_cool: tuple[str, ...] = ("M109 R{c}", "M104 S0")
 
 
@@ -65,9 +78,18 @@ DIALECTS: dict[str, Dialect] = {
         "M204 S{a}",
         g91_moves_e=True,
         reads=frozenset({"marlin"}),
-        wait_to_cool=("TEMPERATURE_WAIT SENSOR=extruder MAXIMUM={c}",),
+        names_heaters=True,
+        tool_zeroes_e=True,  # klippy/extras/gcode_move.py, _handle_activate_extruder
+        wait_to_cool=("TEMPERATURE_WAIT SENSOR={sensor} MAXIMUM={c}",),
     ),
-    "reprap": Dialect("reprap", "M204 P{a}"),
+    # Its heads that wait have a temperature of their own (docs.duet3d.com, G10 and M568), which
+    # M104 sets too (GCodes2.cpp, case 104); M109 takes a head where none is taken.
+    "reprap": Dialect(
+        "reprap",
+        "M204 P{a}",
+        head_off="G10 P{k} S0 R0",
+        head_heats=("M104 T{k} S{c}", "M116 P{k}"),
+    ),
 }
 
 
@@ -105,6 +127,12 @@ def command_of(line: str) -> tuple[str, str]:
         return name, rest
     letter, number_, after = code.groups()
     return f"{letter}{number_}{f'.{after}' if after else ''}", command[code.end() :].lstrip()
+
+
+def heaters_off(dialect: str, heads: int) -> list[str]:
+    """Lines that switch off the heaters of so many heads, and of the bed, and the fan."""
+    others = [dialect_of(dialect).head_off.format(k=k) for k in range(heads) if heads > 1]
+    return ["M104 S0", *others, "M140 S0", "M107"]
 
 
 def fan_command(ratio: float) -> str:

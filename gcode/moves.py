@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -215,14 +215,16 @@ class ModalState:
         (x, y, z) of the nozzle, build frame, whatever G92 made of the coordinates.
     e_mm
         Logical extruder position (what `G92 E` would have to say).
-    hotend_c, bed_c
-        Targets, °C.
+    hotends_c, bed_c
+        Targets, °C, of each head's own heater; of several filaments to one nozzle there is one.
     acceleration_mm_s2
         Of printing moves; None where the program never set it.
     units_mm
         False after G20.
+    tool
+        The head, or the filament, that is chosen.
     pulled_mm
-        Filament that is pulled back, mm: so much of the next push melts nothing.
+        Its filament that is pulled back, mm: so much of the next push melts nothing.
     """
 
     position_mm: tuple[float, float, float]
@@ -231,9 +233,25 @@ class ModalState:
     absolute_e: bool = True
     feed_mm_s: float = 0.0
     fan_ratio: float = 0.0
-    hotend_c: float = 0.0
+    hotends_c: tuple[float, ...] = (0.0,)
     bed_c: float = 0.0
     acceleration_mm_s2: float | None = None
     units_mm: bool = True
     tool: int = 0
     pulled_mm: float = 0.0
+
+    @property
+    def hotend_c(self) -> float:
+        """Target of the head that is chosen."""
+        return self.hotends_c[self.heater]
+
+    @property
+    def heater(self) -> int:
+        """Which of the heaters is that of the head that is chosen."""
+        return self.tool if len(self.hotends_c) > 1 else 0
+
+    def with_hotend(self, target_c: float) -> ModalState:
+        """The same with another target of the head that is chosen."""
+        told = list(self.hotends_c)
+        told[self.heater] = target_c
+        return replace(self, hotends_c=tuple(told))

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from gcode.check import plain_kernels as plain
 from gcode.check.arcs import centre_by_radius, points_of_arc
 from gcode.check.findings import Moves, Policy, Refusal, Text, Warnings
+from gcode.check.heads import heads_of
 from gcode.check.words import (
     G91_MOVES_E,
     GIVES_UP_UNHOMED,
@@ -83,6 +84,7 @@ class Motion:
         self._standing_top_mm = standing_top_mm
         self._stood = initial is not None or standing_top_mm is not None
         self._stood_before = self._stood  # before the present move
+        self._beside_bed = False  # the present move
         state = initial
         self._place: list[float | None] = [None] * 3 if state is None else [*state.position_mm]
         # A part stands on a machine that was not switched off, so Z is still true.
@@ -92,15 +94,13 @@ class Motion:
         self._e = state.e_mm if state else 0.0
         self._feed_mm_s = state.feed_mm_s if state else 0.0
         self._unit = 1.0 if state is None or state.units_mm else INCH_MM
-        self._hotend_c = state.hotend_c if state else 0.0
-        self._ready_c = self._hotend_c  # what the hotend was waited for
+        self._heads, chosen = heads_of(setup.printer, state)
+        self._head = self._heads[chosen]
         self._bed_c = state.bed_c if state else 0.0
         self._risen_mm = 0.0  # by moves of Z before it was homed
         self._heats_unsaid = False  # whether a macro ran that may have heated something
         self._chamber_c = 0.0
-        self._pulled_mm = 0.0 if state is None else state.pulled_mm
         self._short_mm3 = 0.0
-        self._loads = False  # another filament was taken, and nothing is printed of it yet
         self._line, self._text = 0, ""
         printer = setup.printer
         x0, y0, x1, y1 = printer.reach_box_mm
@@ -126,13 +126,13 @@ class Motion:
         )
         self.commands += int(counts[0])
         self.moves.count = int(counts[1])
-        x, y, z, self._e, self._feed_mm_s, self._pulled_mm, self._short_mm3 = state[:7].tolist()
-        self._place = [x, y, z]
+        *place, self._e, self._feed_mm_s, self._head.pulled_mm, self._short_mm3 = state[:7].tolist()
+        self._place = place
         return int(at) + 1
 
     def _state(self) -> Float[np.ndarray, " n"]:
         modes = (self._absolute, self._e_is_absolute, self._unit)
-        used = (self._e, self._feed_mm_s, self._pulled_mm, self._short_mm3)
+        used = (self._e, self._feed_mm_s, self._head.pulled_mm, self._short_mm3)
         return np.array([*self._place, *used, *modes], dtype=np.float64)
 
     def _plain_limits(self) -> Float[np.ndarray, " n"]:
@@ -153,7 +153,7 @@ class Motion:
     def _cold(self) -> bool:
         """Whether no line has waited for a hotend that melts; what a macro did only it knows."""
         may_be_hot = self._heats_unsaid and self._lenient
-        return self._ready_c < self._setup.printer.min_extrude_c and not may_be_hot
+        return self._head.ready_c < self._setup.printer.min_extrude_c and not may_be_hot
 
     @property
     def _lenient(self) -> bool:
@@ -172,7 +172,7 @@ class Motion:
 
     @property
     def _hot_on_part(self) -> bool:
-        return self._hotend_c >= self._setup.printer.min_extrude_c and self._occupied
+        return self._head.target_c >= self._setup.printer.min_extrude_c and self._occupied
 
     def _backwards(self, text: Text) -> None:
         """Relative values of E that are read as absolute go back and forth."""
@@ -337,6 +337,7 @@ class Motion:
                 low_mm = min(start[2], end[2])
                 self._refuse("bead in the bed", f"Z {low_mm:g} mm", f"{LEAST_BEAD_Z_MM:g} mm")
             self._stood_before = self._occupied
+            self._beside_bed = self._off_bed(start) and self._off_bed(end)
             if length_mm > 0:
                 self.moves.add(self._line, start, end, pushed_mm * self._area_mm2)
         elif moved and self._standing_top_mm is not None and pushed_mm <= 0:
@@ -372,6 +373,10 @@ class Motion:
                     math.inf,  # the firmware goes no faster than it can
                 )
 
+    def _off_bed(self, place: tuple[float, float, float]) -> bool:
+        x0, y0, x1, y1 = self._setup.printer.bed_box_mm
+        return not (x0 <= place[0] <= x1 and y0 <= place[1] <= y1)
+
     def _bounded(self, target: list[float | None], *, lays: bool) -> list[float | None]:
         """Where the head comes to.
 
@@ -399,10 +404,10 @@ class Motion:
         printer = self._setup.printer
         if pushed_mm > 0 and self._cold:
             self._refuse(
-                "cold extrusion", f"hotend waited for at {self._ready_c:g} °C",
+                "cold extrusion", f"hotend waited for at {self._head.ready_c:g} °C",
                 f"{printer.min_extrude_c:g} °C",
             )  # fmt: skip
-            self._ready_c = math.inf  # said once
+            self._head.ready_c = math.inf  # said once
         if length_mm <= SHORT_MM and (known or self.policy is Policy.STRICT):
             self._short(pushed_mm, length_mm)
             return
@@ -410,27 +415,29 @@ class Motion:
         if pushed_mm < 0:
             self._pull(pushed_mm)
             return
-        if self._pulled_mm > printer.max_extrude_only_mm:
+        if self._head.pulled_mm > printer.max_extrude_only_mm:
             if (
-                self._loads
+                self._head.loads
                 and pushed_mm * self._area_mm2 > printer.max_bead_section_mm2 * length_mm
             ):
                 self._fresh_mm3(pushed_mm)  # too much for a bead: it is on its way to the nozzle
                 return
-            if not self._loads:
-                told = (f"{self._pulled_mm:.1f} mm", f"{printer.max_extrude_only_mm:g} mm")
+            if not self._head.loads:
+                told = (f"{self._head.pulled_mm:.1f} mm", f"{printer.max_extrude_only_mm:g} mm")
                 self._refuse("pulls filament back and prints on", *told)
-            self._pulled_mm = 0.0  # said once; or a bead, so what changed the filament loaded it
+            # said once; or a bead, so what changed the filament loaded it
+            self._head.pulled_mm = 0.0
         fresh_mm3 = self._fresh_mm3(pushed_mm)
-        self._loads = self._loads and fresh_mm3 <= 0.0
+        self._head.loads = self._head.loads and fresh_mm3 <= 0.0
         if not known:  # from an end stop, which may lie a whole line away
             return
         section_mm2 = fresh_mm3 / length_mm
         limit_mm2 = printer.max_bead_section_mm2
         if section_mm2 > SECTION_SLACK * limit_mm2:
             told = (f"{section_mm2:.3f} mm²", f"{limit_mm2:g} mm²")
-            # Purging, before there is a part that a blob could be dragged into, is as thick as may.
-            gross = GROSS if self._stood_before else math.inf
+            # Purging, before there is a part that a blob could be dragged into, or beside the bed,
+            # as each of several heads does, is as thick as may.
+            gross = GROSS if self._stood_before and not self._beside_bed else math.inf
             self._beyond("bead too thick", *told, section_mm2 / limit_mm2, gross)
         self._melts(section_mm2)
 
@@ -468,15 +475,15 @@ class Motion:
 
     def _fresh_mm3(self, pushed_mm: float) -> float:
         """What leaves the nozzle of what is pushed: first comes back what was pulled."""
-        back_mm = min(pushed_mm, self._pulled_mm)
-        self._pulled_mm -= back_mm
+        back_mm = min(pushed_mm, self._head.pulled_mm)
+        self._head.pulled_mm -= back_mm
         return (pushed_mm - back_mm) * self._area_mm2
 
     def _pull(self, pushed_mm: float) -> None:
-        self._pulled_mm -= pushed_mm
+        self._head.pulled_mm -= pushed_mm
         printer, limit_mm = self._setup.printer, self._setup.printer.max_extrude_only_mm
-        if self._pulled_mm > limit_mm and not printer.one_nozzle:  # else it changes filaments
-            told = ("pulls filament back", f"{self._pulled_mm:.1f} mm", f"{limit_mm:g} mm")
+        if self._head.pulled_mm > limit_mm and not printer.one_nozzle:  # else it changes filaments
+            told = ("pulls filament back", f"{self._head.pulled_mm:.1f} mm", f"{limit_mm:g} mm")
             # Unloading; that it prints on after that is refused.
-            if self._beyond(*told, self._pulled_mm / limit_mm, math.inf):
-                self._pulled_mm = 0.0  # said once
+            if self._beyond(*told, self._head.pulled_mm / limit_mm, math.inf):
+                self._head.pulled_mm = 0.0  # said once

@@ -7,8 +7,10 @@ import re
 
 from gcode.check import limits, touches, waits
 from gcode.check.findings import Policy, Text, Touch
+from gcode.check.heads import Hotend, switching_off
 from gcode.check.motion import PLACE_SLACK_MM, STILL_S, Motion
 from gcode.check.words import (
+    CHOOSES,
     G90_SETS_E,
     KNOWN_COMMANDS,
     LENIENT_OF_MOVES,
@@ -18,6 +20,8 @@ from gcode.check.words import (
     PARKS,
     PROBES,
     STARTS,
+    TOOL_ZEROES_E,
+    TWO_HEATS,
     parameters,
     start_heats,
     without_lists,
@@ -48,8 +52,8 @@ _NAMED = re.compile(r"([A-Z_]{3,}[A-Z0-9_]*)")
 # A letter and a number, or a name and named words: some firmware's command.
 _OF_SOME_FIRMWARE = re.compile(r"[A-Z]\s*-?\d.*|[A-Z_]\w*(?: +\w+=\S+)*")
 _PLAIN = re.compile(r"^[\x20-\x7e\t]*$")
-_OTHER_EXTRUDER = re.compile(r"EXTRUDER(\d+)")
-KLIPPER_HEATERS = {"EXTRUDER": "M104", "HEATER_BED": "M140"}
+_EXTRUDER = re.compile(r"EXTRUDER(\d{0,3})")
+KLIPPER_HEATERS = {"HEATER_BED": "M140"}
 # Factors on flow (M221) and speed (M220), per cent.
 FACTOR_LIMITS = {"M221": ("flow factor", 50.0, 150.0), "M220": ("speed factor", 10.0, 200.0)}
 TO_PLACES = frozenset({"G0", "G1", "G2", "G3"})
@@ -86,6 +90,7 @@ class Judge(Motion):
     ) -> None:
         super().__init__(program, setup, standing_top_mm, initial, policy)
         self._touches = planned
+        self._laid_down = False  # the head that was chosen
         self.added: tuple[str, ...] = ()
         macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
@@ -97,14 +102,13 @@ class Judge(Motion):
         self._feels = touches.TOUCH_COMMANDS.get(program.dialect, "") if planned else ""
         if self._feels:
             self._known |= {self._feels}
-        self._tool: str | None = None
+        self._tool = None if initial is None else f"T{initial.tool}"
         # The line that homed Z at the end, and how far E had gone by then.
         self._end_homed: tuple[int, float] | None = None
-        # The temperatures of heads that do not print: told, and waited for.
-        self._parked_c: dict[str, tuple[float, float]] = {}
         if setup.printer.heads > 1:
             self._known |= {f"T{k}" for k in range(setup.printer.heads)}
             self._known |= PARKS.get(program.dialect, frozenset())
+            self._known |= CHOOSES.get(program.dialect, frozenset())
 
     def read(self, number: int, raw: str) -> None:
         """Judge one line."""
@@ -176,10 +180,9 @@ class Judge(Motion):
         if not self._alone:
             return
         heaters = (
-            ("hotend", self._hotend_c, "M104 S0"),
+            *switching_off(self._heads, None if self._laid_down else self._head, self._dialect),
             ("bed", self._bed_c, "M140 S0"),
             ("chamber", self._chamber_c, "M141 S0"),
-            *((f"hotend of {k}", c, f"M104 {k} S0") for k, (c, _) in self._parked_c.items()),
         )
         for what, value_c, off in heaters:
             if value_c <= 0:
@@ -214,17 +217,26 @@ class Judge(Motion):
                 several = [self._number(value) for value in given[key].split(",")]
                 self._heat(heat, {"S": max(several, key=lambda value: value or 0.0)})
         elif name == "TURN_OFF_HEATERS" or (self._ends and name == self._ends.upper()):
-            self._hotend_c = self._ready_c = self._bed_c = self._chamber_c = 0.0
-            self._parked_c.clear()
+            self._bed_c = self._chamber_c = 0.0
+            for head in self._heads:
+                head.off()
             if name != "TURN_OFF_HEATERS":
                 self._place = [None] * 3  # it goes where it parks
         elif name == "SET_HEATER_TEMPERATURE":
             # Where no target is given, Klipper takes 0.
             target_c = self._number(given.get("TARGET", "0"))
             heater = given.get("HEATER", "")
-            tool = _OTHER_EXTRUDER.fullmatch(heater)
+            tool = _EXTRUDER.fullmatch(heater)
             which = "M104" if tool else KLIPPER_HEATERS.get(heater, "M141")
-            self._heat(which, {"S": target_c} | ({"T": float(tool[1])} if tool else {}))
+            self._heat(which, {"S": target_c} | ({"T": float(tool[1] or 0)} if tool else {}))
+        elif name == "ACTIVATE_EXTRUDER":
+            tool = _EXTRUDER.fullmatch(given.get("EXTRUDER", ""))
+            chosen = f"T{int(tool[1] or 0)}" if tool else ""
+            if chosen in self._known:
+                self._choose(chosen)
+            else:
+                heads = _heads_told(self._setup.printer.heads)
+                self._refuse("another tool", given.get("EXTRUDER", "no EXTRUDER"), heads)
         elif name == "SET_PRESSURE_ADVANCE":
             self._advance(self._number(given.get("ADVANCE")))
         elif name == "SET_TMC_CURRENT":
@@ -255,14 +267,18 @@ class Judge(Motion):
     def _wait_for_sensor(self, given: dict[str, str]) -> None:
         sensor = given.get("SENSOR", "").strip("\"'")
         low_c, high_c = (self._number(given.get(key)) for key in ("MINIMUM", "MAXIMUM"))
-        told_c = {"EXTRUDER": self._hotend_c, "HEATER_BED": self._bed_c}.get(sensor)
+        heats = _EXTRUDER.fullmatch(sensor)
+        head = self._meant(float(heats[1] or 0)) if heats else None
+        told_c = None if head is None else head.target_c
+        if sensor == "HEATER_BED":
+            told_c = self._bed_c
         if told_c is not None and self._heats_unsaid:  # a macro may have told it more
             printer = self._setup.printer
             told_c = None if sensor == "HEATER_BED" else printer.max_hotend_c
         for refusal in waits.for_sensor(sensor, low_c, high_c, told_c, self._setup.printer):
             self._refuse(*refusal)
-        if sensor == "EXTRUDER" and low_c is not None:
-            self._ready_c = low_c
+        if head is not None and low_c is not None:
+            head.ready_c = low_c
 
     def _offset(self, given: dict[str, str]) -> None:
         for letter in "XYZ":
@@ -279,26 +295,46 @@ class Judge(Motion):
             return None
 
     def _choose(self, tool: str) -> None:
-        """Of several filaments to one nozzle each may be taken at any time, of heads one prints.
+        """Each head, and each of several filaments to one nozzle, may be taken at any time.
 
         The only tool may have any number. What changes the filament loads it behind our back, so
-        what was pulled back of the last one comes back as far as the next one is pushed here.
+        what was pulled back of the last one comes back as far as the next one is pushed here. A
+        head has its own heater and its own filament; where it is after a change the firmware and
+        the job's slicer know, who both take its height for what it was.
         """
         printer, pushed = self._setup.printer, self.moves.sums.pushed
         before = self._tool or ("T0" if pushed or printer.heads > 1 else tool)
-        if tool != before and not printer.one_nozzle and (pushed or printer.heads == 1):
-            limit = f"{before}, as it began"
-            if printer.heads == 1:
-                limit += "; where filaments change, the profile's 'heads' and 'one_nozzle' say so"
+        if tool != before and printer.heads == 1:
+            limit = f"{before}, as it began; where heads change, the profile's 'heads' says so, "
+            limit += "where filaments do, 'one_nozzle' too"
             self._refuse("change of tool or filament", tool, limit)
             self._tool = before
             return
         if printer.docks:
-            self._parked_c[before] = (self._hotend_c, self._ready_c)
-            self._hotend_c, self._ready_c = self._parked_c.pop(tool, (0.0, 0.0))
-            self._place = [None] * 3  # where it is picked up
-        self._loads = tool != before or self._loads
+            number = int(tool[1:])
+            if number >= printer.heads:  # a firmware that is lenient goes on with the one it has
+                self._refuse("another tool", tool, _heads_told(printer.heads))
+                return
+            self._head, self._short_mm3, self._laid_down = self._heads[number], 0.0, False
+            self._place[:2] = None, None
+            if tool != before and self._dialect in TOOL_ZEROES_E:
+                self._e = 0.0
+        elif tool != before:
+            self._head.loads = True
         self._tool = tool
+
+    def _meant(self, told: float | None) -> Hotend | None:
+        """The head whose heater a line means, by its number or none; None where it is not there.
+
+        Of one heater the filament, or the only tool, may have its number.
+        """
+        printer = self._setup.printer
+        if told is None:
+            return self._head
+        there = 0 <= told < printer.heads
+        if printer.docks:
+            return self._heads[int(told)] if there else None
+        return self._head if there or f"T{told:g}" in {"T0", self._tool} else None
 
     # ------------------------------------------------------------------ commands
 
@@ -333,7 +369,8 @@ class Judge(Motion):
         elif name in HEATER_COMMANDS:
             self._heat(name, words)
         elif name in {"M116", "M6"}:  # wait for all heaters, and for the nozzle's
-            self._ready_c = self._hotend_c
+            for head in self._heads if name == "M116" else (self._head,):
+                head.ready_c = head.target_c
         elif name in {"G10", "M568"} and self._dialect == "reprap" and {"P", "L"} & words.keys():
             self._tool_settings(name, words)
         elif name in {"G10", "G11"}:
@@ -372,8 +409,9 @@ class Judge(Motion):
                 self._refuse("cold extrusion allowed", told or name, f"S{LEAST_COLD_C:g} and more")
         elif name == "M200" and (words.get("D") or words.get("S")):
             self._refuse("extrusion told as a volume", name, "D0")
-        elif name in {"G27", "M132", "P0"}:
-            self._place = [None] * 3  # where it parks, and where its end stops are
+        elif name in {"G27", "M132", "P0"}:  # where it parks, and where its end stops are
+            self._place = [None, None, self._place[2] if name == "P0" else None]
+            self._laid_down = self._laid_down or name == "P0"
         elif name == "G5" and words:
             self._refuse("curve that nothing here follows", name, "G1, G2 and G3")
         elif name == "M211" and 0.0 in words.values():
@@ -426,10 +464,13 @@ class Judge(Motion):
             else:
                 self._shift(f"{name} {letter}", words.get(letter))
         if "L" not in words:
-            self._temperature("standby", waits.switched_c(words.get("R"), self._dialect))
+            standby_c = waits.switched_c(words.get("R"), self._dialect)
+            tool = {"T": words["P"]} if self._setup.printer.heads > 1 else {}
+            self._temperature("standby", standby_c)
+            if standby_c is not None and (head := self._meant(tool.get("T"))) is not None:
+                head.standby_c = standby_c
             if "S" in words:
-                tool = {"T": words["P"]} if self._setup.printer.heads > 1 else {}
-                self._heat("M104", {"S": words["S"]} | tool)
+                self._heat("M104", {"S": words["S"]} | tool, of_two=True)
 
     def _shift(self, what: str, value_mm: float | None) -> None:
         if value_mm is not None and abs(value_mm) > PLACE_SLACK_MM:
@@ -443,7 +484,8 @@ class Judge(Motion):
         else:
             self._refuse(what, f"{percent:g} %", f"{low:g} to {high:g} %")
 
-    def _heat(self, name: str, words: dict[str, float | None]) -> None:
+    def _heat(self, name: str, words: dict[str, float | None], *, of_two: bool = False) -> None:
+        """A heater's temperature; of two that a head has, `of_two`, or the only one."""
         value_c = waits.told_c(words, self._dialect)
         what = HEATER_COMMANDS[name]
         for refusal in waits.for_cooling(name, what, words, self._dialect):
@@ -455,27 +497,21 @@ class Judge(Motion):
             if words.get(letter) is None:
                 continue
             self._refuse("temperature that the firmware chooses", f"{name} {letter}", "S alone")
-        if what == "hotend":
-            heads, prints = self._setup.printer.heads, self._tool or "T0"
-            told = words.get("T")
-            tool = f"T{told or 0.0:g}" if told is not None or heads == 1 else prints
-            if not (0 <= (told or 0.0) < heads or tool in {"T0", prints}):
-                if value_c != 0:  # firmwares pass over one that is not there
-                    self._refuse("hotend of another tool", tool, _heads_told(heads))
-                return
+        head = self._meant(words.get("T")) if what == "hotend" else None
+        if what == "hotend" and head is None:
+            if value_c != 0:  # firmwares pass over one that is not there
+                heads = _heads_told(self._setup.printer.heads)
+                self._refuse("hotend of another tool", f"T{words['T']:g}", heads)
+            return
         self._temperature(what, value_c)
         if what == "bed":
             self._bed_c = value_c
         elif what == "chamber":
             self._chamber_c = value_c
-        elif self._setup.printer.docks and tool != prints:
-            _, ready_c = self._parked_c.get(tool, (0.0, 0.0))
-            self._parked_c[tool] = value_c, value_c if name == "M109" else min(ready_c, value_c)
-        else:
-            self._hotend_c = value_c
-            # The heater was waited for, or cools from now on.
-            if name == "M109" or value_c < self._ready_c:
-                self._ready_c = value_c
+        elif head is not None:
+            head.heat(value_c, waits=name == "M109")
+            if self._dialect in TWO_HEATS and not of_two:
+                head.standby_c = value_c
 
     def _temperature(self, what: str, value_c: float | None) -> None:
         """No chamber gets as hot as a bed."""
@@ -505,7 +541,12 @@ class Judge(Motion):
         """The head is swept down to what it is to feel; words in mm and mm/min."""
         planned = touches.planned_at(self._touches, self._place)
         wrong = touches.refusal_of(
-            planned, words, self._place[2], self._text, self._hotend_c, self._setup.printer.probe
+            planned,
+            words,
+            self._place[2],
+            self._text,
+            self._head.target_c,
+            self._setup.printer.probe,
         )
         if not self._absolute:
             self._refuse("touch that is not straight down", "G91", "G90")

@@ -74,6 +74,13 @@ _START_HEATS = {"M109": ("EXTRUDER", "HOTEND", "NOZZLE"), "M190": ("BED",)}
 # Of a machine with several heads: what lays the present one down (Prusa's XL; RepRapFirmware's
 # `T-1`, which is read as this).
 PARKS = {"marlin": frozenset({"P0"}), "prusa": frozenset({"P0"}), "reprap": frozenset({"P0"})}
+# What else chooses one of several heads; the next one's E is then 0 (klippy/extras/gcode_move.py,
+# _handle_activate_extruder).
+CHOOSES = {"klipper": frozenset({"ACTIVATE_EXTRUDER"})}
+TOOL_ZEROES_E = frozenset({"klipper"})
+# RepRapFirmware's heads have another temperature while they wait, which M104 and M109 set as well:
+# who uses them knows of no two (GCodes2.cpp, case 104).
+TWO_HEATS = frozenset({"reprap"})
 # Klipper has none: what came of a line is kept until its end (klippy/gcode.py, _process_data;
 # klippy/extras/virtual_sdcard.py). OrcaSlicer tells outlines in 9,000 characters.
 LINE_LIMIT = {"marlin": 95, "prusa": 95, "klipper": math.inf, "reprap": 255}

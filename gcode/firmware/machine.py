@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 
 from gcode.firmware.mechanics import HOMING_MM_S, LARGEST, Mechanics, words_of
 from gcode.firmware.thermal import RESIDENCY_S, Heater
@@ -62,12 +63,18 @@ class Machine(Mechanics):
             table[named] = getattr(self, f"_{way}")
         takes = self.variant.takes
         if (heads := self.profile.heads) > 1:
-            takes |= {f"T{k}".encode() for k in range(heads)} | self.variant.parks
+            table |= {f"T{k}".encode(): partial(self._choose, k) for k in range(heads)}
+            takes |= self.variant.parks
         for taken in takes:
             table.setdefault(taken, self._ignore)
         for unbuilt in self.variant.unbuilt:
             table.pop(unbuilt)
         return table
+
+    def _choose(self, head: int, rest: bytes) -> None:
+        other = self.heads.choose(head, self.clock_s)
+        if other and self.variant.tool_zeroes_e:
+            self.e = 0.0
 
     def _ignore(self, rest: bytes) -> None:
         """Accept a command whose effect an emulated machine cannot show."""
@@ -164,13 +171,17 @@ class Machine(Mechanics):
             bed = "BED" in key
             if bed or any(word in key for word in ("EXTRUDER", "HOTEND", "NOZZLE")):
                 heater = self.bed if bed else self.hotend
-                heater.set_target(float(value), self.clock_s)
+                if bed:
+                    heater.set_target(float(value), self.clock_s)
+                else:
+                    self.heads.heat(self.heads.chosen, float(value), self.clock_s)
                 until_s = max(until_s, heater.reached_s(cooling=False))
         self._home({"X", "Y", "Z"}, until_s=until_s)
 
     def _end_print(self, rest: bytes) -> None:
-        for heater in (self.hotend, self.bed):
-            heater.set_target(0.0, self.clock_s)
+        for head in range(len(self.heads.heaters)):
+            self.heads.heat(head, 0.0, self.clock_s)
+        self.bed.set_target(0.0, self.clock_s)
 
     def _g29(self, rest: bytes) -> None:
         def probed() -> None:
@@ -248,7 +259,11 @@ class Machine(Mechanics):
     def _temperature_wait(self, rest: bytes) -> None:
         """Klipper's wait until a sensor is warm or cold enough (klippy/extras/heaters.py)."""
         said = dict(word.partition(b"=")[::2] for word in rest.upper().split())
-        heater = self.bed if said.get(b"SENSOR") == b"HEATER_BED" else self.hotend
+        heater = self.bed
+        if (sensor := said.get(b"SENSOR")) != b"HEATER_BED":
+            if (head := self._named_head(sensor or b"")) is None:
+                return
+            heater = self.heads.heaters[head]
         if b"MAXIMUM" in said:
             end_s = heater.cooled_s(float(said[b"MAXIMUM"]), self.clock_s)
         else:
@@ -300,19 +315,72 @@ class Machine(Mechanics):
     _m18 = _m84
 
     def _m104(self, rest: bytes) -> None:
-        self.hotend.set_target(words_of(rest).get("S", 0.0), self.clock_s)
+        words = words_of(rest)
+        if (head := self._meant(b"M104", words.get("T"))) is not None:
+            self.heads.heat(head, words.get("S", 0.0), self.clock_s)
 
     def _m140(self, rest: bytes) -> None:
         self.bed.set_target(words_of(rest).get("S", 0.0), self.clock_s)
 
     def _m109(self, rest: bytes) -> None:
-        self._heat(self.hotend, words_of(rest))
+        words = words_of(rest)
+        if (head := self._meant(b"M109", words.get("T"))) is not None:
+            heater = self.heads.heaters[head]
+            self.heads.heat(head, words.get("R", words.get("S", heater.target_c)), self.clock_s)
+            self._wait_for_heat_of(heater, words)
 
     def _m190(self, rest: bytes) -> None:
-        self._heat(self.bed, words_of(rest))
+        words = words_of(rest)
+        self.bed.set_target(words.get("R", words.get("S", self.bed.target_c)), self.clock_s)
+        self._wait_for_heat_of(self.bed, words)
 
-    def _heat(self, heater: Heater, words: dict[str, float]) -> None:
-        heater.set_target(words.get("R", words.get("S", heater.target_c)), self.clock_s)
+    def _meant(self, command: bytes, told: float | None) -> int | None:
+        """The head that a line's T means, or none; one that is not there is said to be none."""
+        head = self.heads.meant(told)
+        if head is None and self.variant.no_tool:
+            name = f"{command.decode()} T{told:g}"
+            self.replies.append(self.variant.no_tool.format(name=name))
+        return head
+
+    def _tool_settings(self, rest: bytes) -> None:
+        """RepRapFirmware's temperatures of a head; without P it is a firmware retraction."""
+        words = words_of(rest)
+        if "P" in words and (head := self._meant(b"G10", words["P"])) is not None:
+            self.heads.tell(head, words.get("S"), words.get("R"), self.clock_s)
+
+    def _wait_for_heat(self, rest: bytes) -> None:
+        """RepRapFirmware's wait for all heaters, or those of one head."""
+        head = self.heads.meant(words_of(rest).get("P"))
+        each = (
+            self.heads.heaters if b"P" not in rest.upper() else self.heads.heaters[head or 0 :][:1]
+        )
+        end_s = max(heater.reached_s(cooling=False) for heater in each)
+        self.wait_for(max(end_s, self.planner.drained_s(self.clock_s)), heating=True)
+
+    def _set_heater_temperature(self, rest: bytes) -> None:
+        """Klipper's (klippy/extras/heaters.py); without a target it switches off."""
+        said = dict(word.partition(b"=")[::2] for word in rest.upper().split())
+        name, target_c = said.get(b"HEATER", b""), float(said.get(b"TARGET", b"0"))
+        if name == b"HEATER_BED":
+            self.bed.set_target(target_c, self.clock_s)
+        elif (head := self._named_head(name)) is not None:
+            self.heads.heat(head, target_c, self.clock_s)
+
+    def _activate_extruder(self, rest: bytes) -> None:
+        """Klipper's (klippy/kinematics/extruder.py)."""
+        said = dict(word.partition(b"=")[::2] for word in rest.upper().split())
+        if (head := self._named_head(said.get(b"EXTRUDER", b""))) is not None:
+            self._choose(head, b"")
+
+    def _named_head(self, name: bytes) -> int | None:
+        match = re.fullmatch(rb"EXTRUDER(\d{0,3})", name)
+        head = None if match is None else int(match[1] or b"0")
+        if head is None or head >= len(self.heads.heaters):
+            self.replies.append(f"!! The value '{name.decode('latin-1').lower()}' is not valid")
+            return None
+        return head
+
+    def _wait_for_heat_of(self, heater: Heater, words: dict[str, float]) -> None:
         reached_s = heater.reached_s(cooling="R" in words)
         if reached_s > self.clock_s:
             reached_s += RESIDENCY_S

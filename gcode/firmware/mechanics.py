@@ -12,10 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gcode.firmware.contact import ProbeContact
+from gcode.firmware.heads import Heads
 from gcode.firmware.laid import Laid
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.planner import Planner
-from gcode.firmware.thermal import BED_HEATER, HOTEND, Heater
+from gcode.firmware.thermal import BED_HEATER, Heater
 from gcode.firmware.variants import Variant
 from gcode.profiles import PrinterProfile
 from gcode.surfaces import HeightField
@@ -57,7 +58,7 @@ class Wait:
 
 
 class Mechanics:
-    """A Cartesian printer with one extruder, a heated bed and a fan."""
+    """A Cartesian printer with one head or more, a heated bed and a fan."""
 
     def __init__(self, profile: PrinterProfile, variant: Variant) -> None:
         self.profile = profile
@@ -107,9 +108,11 @@ class Mechanics:
         executed = self.planner.executed
         self.planner = self._new_planner()
         self.planner.executed = executed
-        self.hotend, self.bed = Heater(HOTEND), Heater(BED_HEATER)
-        for heater in (self.hotend, self.bed):
-            heater.set_target(0.0, self.clock_s)
+        self.heads = Heads(
+            self.profile.nozzles, self.clock_s, waits_cooler=self.variant.waits_cooler
+        )
+        self.bed = Heater(BED_HEATER)
+        self.bed.set_target(0.0, self.clock_s)
         self.x = self.y = self.z = 0.0
         self.e = self.native_e = 0.0  # logical, as G92 sets it; and all of it
         self.offset = [0.0, 0.0, 0.0]  # logical = native + offset
@@ -130,6 +133,11 @@ class Mechanics:
         self.auto_temperature_s = self.auto_position_s = 0.0
         self.message = ""
         self.wait = None
+
+    @property
+    def hotend(self) -> Heater:
+        """The heater of the head that is chosen."""
+        return self.heads.heater
 
     def _new_planner(self) -> Planner:
         profile = self.profile
@@ -288,7 +296,7 @@ class Mechanics:
             return
         self.quick_stop()
         self.fan_ratio = 0.0
-        heaters = (self.hotend, self.bed)
+        heaters = (*self.heads.heaters, self.bed)
         if self.variant.once_halted:
             for heater in heaters:
                 heater.cut(self.clock_s)  # its boards do so; klippy goes on telling the target
@@ -314,9 +322,20 @@ class Mechanics:
 
     def temperatures(self) -> str:
         """The text of a temperature report."""
-        heaters, now_s = (self.hotend, self.bed), self.clock_s
+        each, now_s = self.heads.heaters, self.clock_s
+        word = self.variant.heat_of_head
+        told = "".join(
+            word.format(heater.temperature_c(now_s), heater.target_c, k=k)
+            for k, heater in enumerate(each)
+        )
+        of_each = told if len(each) > 1 or self.variant.tells_each_head else ""
         return self.variant.heat.format(
-            *(c for heater in heaters for c in (heater.temperature_c(now_s), heater.target_c))
+            *(
+                c
+                for heater in (self.hotend, self.bed)
+                for c in (heater.temperature_c(now_s), heater.target_c)
+            ),
+            heads=of_each,
         )
 
     def position_text(self) -> str:

@@ -224,6 +224,7 @@ class PtyServer:
                     "killed": machine.killed,
                     "hotend_c": machine.hotend.temperature_c(machine.clock_s),
                     "hotend_target_c": machine.hotend.target_c,
+                    "hotend_targets_c": [one.target_c for one in machine.heads.heaters],
                     "bed_c": machine.bed.temperature_c(machine.clock_s),
                     "bed_target_c": machine.bed.target_c,
                     "motors_let_go": machine.let_go,

@@ -55,6 +55,12 @@ class Variant:
         The answer to M115 is a part of the `ok`.
     place, heat
         The answers to M114 and M105; `{steps}` are those of X, Y and Z.
+    heat_of_head, tells_each_head
+        What M105 tells of head `{k}` of several; whether of an only one, too.
+    waits_cooler
+        A head that is not chosen has a temperature of its own.
+    tool_zeroes_e
+        Another head's E begins at 0.
     motors_off_s
         After the last move; infinity where they keep a part of their current.
     m84_sets_time
@@ -94,7 +100,11 @@ class Variant:
     about_in_ok: bool = False
     advanced_ok: bool = False
     place: str = "X:{x:.2f} Y:{y:.2f} Z:{z:.2f} E:{e:.2f} Count {steps}"
-    heat: str = "T:{0:.2f} /{1:.2f} B:{2:.2f} /{3:.2f} @:0 B@:0"
+    heat: str = "T:{0:.2f} /{1:.2f} B:{2:.2f} /{3:.2f}{heads} @:0 B@:0"
+    heat_of_head: str = " T{k}:{0:.2f} /{1:.2f}"
+    tells_each_head: bool = False
+    waits_cooler: bool = False
+    tool_zeroes_e: bool = False
     motors_off_s: float = 120.0
     m84_sets_time: bool = True
     g92_homes: bool = False
@@ -194,7 +204,10 @@ FIRMWARES: dict[str, Variant] = {
         passes=frozenset({b"M112"}),
         about_in_ok=True,
         place="X:{x:.3f} Y:{y:.3f} Z:{z:.3f} E:{e:.3f}",
-        heat="B:{2:.1f} /{3:.1f} T0:{0:.1f} /{1:.1f}",
+        heat="B:{2:.1f} /{3:.1f}{heads}",
+        heat_of_head=" T{k}:{0:.1f} /{1:.1f}",
+        tells_each_head=True,
+        tool_zeroes_e=True,
         motors_off_s=600.0,
         m84_sets_time=False,
         halted="// Klipper state: Shutdown",
@@ -210,6 +223,9 @@ FIRMWARES: dict[str, Variant] = {
         named={
             b"AMREPAIR_TOUCH": "amrepair_touch",
             b"TEMPERATURE_WAIT": "temperature_wait",
+            b"SET_HEATER_TEMPERATURE": "set_heater_temperature",
+            b"ACTIVATE_EXTRUDER": "activate_extruder",
+            b"TURN_OFF_HEATERS": "end_print",
             b"SET_KINEMATIC_POSITION": "set_kinematic_position",
             b"PRINT_START": "start_print",
             b"START_PRINT": "start_print",
@@ -233,7 +249,9 @@ FIRMWARES: dict[str, Variant] = {
         no_tool="",
         place="X:{x:.3f} Y:{y:.3f} Z:{z:.3f} E:{e:.3f}",
         motors_off_s=float("inf"),
+        waits_cooler=True,
         g92_homes=True,
         halted="Error: Printer halted. kill() called!",
+        named={b"G10": "tool_settings", b"M568": "tool_settings", b"M116": "wait_for_heat"},
     ),
 }

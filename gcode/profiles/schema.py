@@ -214,9 +214,9 @@ class PrinterProfile(_Profile):
     reach_max_mm: Xy | None = None  # itself where left out
     off_bed_mm: Annotated[float, Field(ge=0, le=100)] = 0.0  # a user's job may, where nobody knows
     nozzle_diameter_mm: Annotated[float, Field(ge=0.1, le=10.0)]  # pellets' are wide
-    heads: Annotated[int, Field(ge=1, le=64)] = 1  # that T0, T1, … choose; a job uses one,
+    heads: Annotated[int, Field(ge=1, le=64)] = 1  # that T0, T1, … choose, each heated by itself,
     tool: Annotated[int, Field(ge=0, lt=64)] = 0  # of them, that programs of ours take
-    one_nozzle: bool = False  # or they are filaments, which it may change
+    one_nozzle: bool = False  # or filaments to one nozzle
     filament_diameter_mm: Annotated[float, Field(ge=1.0, le=3.5)] = 1.75
     max_speed_mm_s: AxisLimits
     max_acceleration_mm_s2: AxisLimits
@@ -286,9 +286,14 @@ class PrinterProfile(_Profile):
         return self.envelope
 
     @property
+    def nozzles(self) -> int:
+        """How many heads there are with a heater and a nozzle of their own."""
+        return 1 if self.one_nozzle else self.heads
+
+    @property
     def docks(self) -> bool:
         """Whether a head must be taken, or its own heater chosen, before it prints."""
-        return self.heads > 1 and not self.one_nozzle
+        return self.nozzles > 1
 
     @property
     def bed_box_mm(self) -> tuple[float, float, float, float]:

@@ -16,6 +16,7 @@ from gcode.dialects import dialect_of
 from gcode.moves import Program
 from gcode.progress import Progress, silent
 from gcode.reader import text_kernels as kernels
+from gcode.reader.named import number_named
 
 BLOCK_CHARS = 1 << 16  # some 2,000 lines: half a megabyte of words and states
 READ_STEPS = 4.0  # words, states, beads, layers: about a second each for a million lines
@@ -30,7 +31,8 @@ class Block:
     first_line
         Number of its first, from 0.
     states
-        (m + 1, 13) of the machine before each line and after the last, as `text_kernels` has them.
+        (m + 1, 12 + heads) of the machine before each line and after the last, as `text_kernels`
+        has them.
     pushed_mm
         (m,) filament pushed by each line.
     comments
@@ -40,7 +42,7 @@ class Block:
     """
 
     first_line: int
-    states: Float[np.ndarray, "m1 13"]
+    states: Float[np.ndarray, "m1 columns"]
     pushed_mm: Float[np.ndarray, " m"]
     comments: list[tuple[int, str]]
     start_mm: Float[np.ndarray, "n 3"]
@@ -64,13 +66,20 @@ class Block:
 
 
 class BlockReader:
-    """Reads texts that go on from one another; nothing is known before the first."""
+    """Reads texts that go on from one another; nothing is known before the first.
 
-    def __init__(self, dialect: str) -> None:
+    Parameters
+    ----------
+    nozzles
+        How many heads the printer has that are heated by themselves.
+    """
+
+    def __init__(self, dialect: str, nozzles: int = 1) -> None:
         words_of = dialect_of(dialect)
-        self._modes = words_of.g90_sets_e, words_of.g91_moves_e
+        self._modes = words_of.g90_sets_e, words_of.g91_moves_e, words_of.tool_zeroes_e
+        self._named = words_of.names_heaters
         self._offset = np.zeros(3)
-        self._state = np.zeros(kernels.STATES)
+        self._state = np.zeros(kernels.S_HOT + nozzles)
         self._state[:3] = np.nan
         self._state[[kernels.S_ABS, kernels.S_ABS_E, kernels.S_MM]] = 1.0
         self._state[kernels.S_ACC] = np.nan
@@ -80,10 +89,12 @@ class BlockReader:
         """The block of the lines of a text."""
         data, starts = lines_of(text)
         kinds, codes, words = tokens_of(data, starts)
+        if self._named:
+            number_named(data, starts, kinds, codes, words)
         comments = self._comments(data, starts, kinds)
         del data
         progress("read", 1.0, READ_STEPS)
-        states = np.zeros((len(starts), kernels.STATES))
+        states = np.zeros((len(starts), len(self._state)))
         states[0] = self._state
         pushed = np.zeros(len(kinds))
         kernels.run(kinds, codes, words, *self._modes, self._offset, states, pushed)
@@ -126,7 +137,7 @@ def lines_of(text: str) -> tuple[UInt8[np.ndarray, " bytes"], Int[np.ndarray, " 
 
 def tokens_of(
     data: UInt8[np.ndarray, " bytes"], starts: Int[np.ndarray, " n1"]
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 10"]]:
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 11"]]:
     """Kinds, codes and words of lines, as `text_kernels.parse` fills them."""
     count = len(starts) - 1
     kinds, codes = np.zeros(count, np.int64), np.zeros(count, np.int64)
@@ -137,7 +148,7 @@ def tokens_of(
 
 
 def blocks_of(program: Program, chars: int = BLOCK_CHARS) -> Iterator[Block]:
-    """A program's blocks, of about so many characters each."""
+    """A program's blocks, of about so many characters each; of several heads as if all were one."""
     text, reader, at = program.text, BlockReader(program.dialect), 0
     while at >= 0:
         end = text.find("\n", at + chars)

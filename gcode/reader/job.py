@@ -158,6 +158,11 @@ class Job:
         return self if own.all() else replace(self, beads=self.beads.subset(own))
 
     @property
+    def nozzles(self) -> int:
+        """How many heads are heated by themselves."""
+        return self.block.states.shape[1] - kernels.S_HOT
+
+    @property
     def tools(self) -> Int[np.ndarray, " m1"]:
         """(m + 1,) the tool that is chosen before each line, and at the end."""
         return np.asarray(self.block.states[:, kernels.S_TOOL].astype(np.int64))
@@ -187,7 +192,7 @@ class Job:
             absolute_e=bool(s[kernels.S_ABS_E]),
             feed_mm_s=float(s[kernels.S_FEED]),
             fan_ratio=float(s[kernels.S_FAN]),
-            hotend_c=float(s[kernels.S_HOT]),
+            hotends_c=tuple(s[kernels.S_HOT :].tolist()),
             bed_c=float(s[kernels.S_BED]),
             acceleration_mm_s2=None if math.isnan(acceleration) else acceleration,
             units_mm=bool(s[kernels.S_MM]),
@@ -200,6 +205,7 @@ def read_job(
     *,
     filament_diameter_mm: float = 1.75,
     dialect: str = "marlin",
+    nozzles: int = 1,
     progress: Progress = silent,
 ) -> Job:
     """Read a program.
@@ -208,6 +214,8 @@ def read_job(
     ----------
     program
         Text of any slicer; for a bare text, `dialect` says whose modes it follows.
+    nozzles
+        How many heads the printer has that are heated by themselves.
 
     Raises
     ------
@@ -225,7 +233,7 @@ def read_job(
     if isinstance(program, str):
         program = Program(program, dialect)
     progress("read", 0.0, READ_STEPS)
-    block = BlockReader(program.dialect).read(program.text, progress)
+    block = BlockReader(program.dialect, nozzles).read(program.text, progress)
     end, owner, filament = block.end_mm, block.line, block.filament_mm
     if not len(owner):
         raise ReadError(NOTHING_LAID)
@@ -243,7 +251,7 @@ def read_job(
     )
 
 
-def job_for(program: Program | str, printer: PrinterProfile) -> Job:
+def job_for(program: Program | str, printer: PrinterProfile, progress: Progress = silent) -> Job:
     """Read a program as the printer that it is meant for understands it.
 
     Parameters
@@ -262,6 +270,8 @@ def job_for(program: Program | str, printer: PrinterProfile) -> Job:
         program,
         filament_diameter_mm=printer.filament_diameter_mm,
         dialect=program.dialect,
+        nozzles=printer.nozzles,
+        progress=progress,
     )
 
 

@@ -8,11 +8,12 @@ import numpy as np
 from gcode.compiled import njit
 
 # Columns of the table of words; the letters in this order.
-LETTERS = b"XYZEFIJRSP"
-X, Y, Z, E, F, I_, J, R, S, P = range(10)
-# Columns of the table of states.
-S_X, S_Y, S_Z, S_E, S_FEED, S_ABS, S_ABS_E, S_FAN, S_HOT, S_BED, S_ACC, S_MM, S_TOOL = range(13)
-STATES = 13
+LETTERS = b"XYZEFIJRSPT"
+X, Y, Z, E, F, I_, J, R, S, P, T = range(11)
+# Columns of the table of states; from the last one on, one for each head's heater.
+S_X, S_Y, S_Z, S_E, S_FEED, S_ABS, S_ABS_E, S_FAN, S_BED, S_ACC, S_MM, S_TOOL, S_HOT = range(13)
+# Among kinds of lines, which are letters else: every heater off.
+ALL_OFF = 1
 INCH_MM = 25.4
 CHORD_MM = 0.01  # an arc is told by chords no further from it than this
 
@@ -97,7 +98,19 @@ def parse(data, starts, letters, codes, kinds, words):
 
 
 @njit(cache=True, nogil=True)
-def run(kinds, codes, words, both_modes, g91_moves_e, offset, states, pushed):
+def heater_of(now, told):
+    """Column of the heater that a line means, which tells a head or none; -1 where it is not there.
+
+    Of a single heater the head may have any number, as long as it is the one that is chosen.
+    """
+    if len(now) == S_HOT + 1:
+        return S_HOT if np.isnan(told) or told == 0 or told == now[S_TOOL] else -1
+    head = now[S_TOOL] if np.isnan(told) else told
+    return S_HOT + int(head) if 0 <= head < len(now) - S_HOT else -1
+
+
+@njit(cache=True, nogil=True)
+def run(kinds, codes, words, both_modes, g91_moves_e, tool_zeroes_e, offset, states, pushed):
     """States after every line (row line + 1) and filament pushed by it, mm.
 
     `offset` (3,) is what G92 moved the axes' zero by so far; it is changed.
@@ -110,7 +123,11 @@ def run(kinds, codes, words, both_modes, g91_moves_e, offset, states, pushed):
         unit = 1.0 if now[S_MM] > 0 else INCH_MM
         w = words[line]
         if kind == 71:  # G
-            if code in (0, 10, 20, 30):
+            if code == 100 and not np.isnan(w[P]) and not np.isnan(w[S]):  # RepRapFirmware's
+                heater = heater_of(now, w[P])
+                if heater >= 0:
+                    now[heater] = max(w[S], 0.0)
+            elif code in (0, 10, 20, 30):
                 for axis in range(3):
                     value = w[axis]
                     if not np.isnan(value):
@@ -152,10 +169,16 @@ def run(kinds, codes, words, both_modes, g91_moves_e, offset, states, pushed):
                 now[S_ABS_E] = 1.0
             elif code == 830:
                 now[S_ABS_E] = 0.0
-            elif code in (1040, 1090) and not np.isnan(w[S]):
-                now[S_HOT] = w[S]
-            elif code == 1090 and not np.isnan(w[R]):
-                now[S_HOT] = w[R]
+            elif code in (1040, 1090):
+                heater = heater_of(now, w[T])
+                if heater >= 0 and not np.isnan(w[S]):
+                    now[heater] = max(w[S], 0.0)
+                elif heater >= 0 and code == 1090 and not np.isnan(w[R]):
+                    now[heater] = w[R]
+            elif code == 5680 and not np.isnan(w[S]):  # the same as G10 with P
+                heater = heater_of(now, w[P])
+                if heater >= 0:
+                    now[heater] = max(w[S], 0.0)
             elif code in (1400, 1900) and not np.isnan(w[S]):
                 now[S_BED] = w[S]
             elif code == 1900 and not np.isnan(w[R]):
@@ -170,7 +193,14 @@ def run(kinds, codes, words, both_modes, g91_moves_e, offset, states, pushed):
                 elif not np.isnan(w[S]):
                     now[S_ACC] = w[S]
         elif kind == 84:  # T
-            now[S_TOOL] = code // 10
+            heads = len(now) - S_HOT
+            if heads == 1 or code // 10 < heads:  # else the firmware goes on with what it has
+                if tool_zeroes_e and heads > 1 and now[S_TOOL] != code // 10:
+                    now[S_E] = 0.0
+                now[S_TOOL] = code // 10
+        elif kind == ALL_OFF:
+            now[S_HOT:] = 0.0
+            now[S_BED] = 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -6,6 +6,7 @@ straight down, and says again what the job had set.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -44,11 +45,11 @@ def prime(head: Head, field: HeightField, printer: PrinterProfile) -> str:
     return "in the air"
 
 
-def temperatures(settings: Settings, setup: PrintSetup) -> tuple[float, float]:
-    """The job's own; the material's where a macro keeps them to itself."""
-    hotend_c = settings.hotend_c or setup.material.hotend_c
+def temperatures(settings: Settings, setup: PrintSetup) -> tuple[tuple[float, ...], float]:
+    """The job's own, of each head and the bed; the material's where a macro keeps them secret."""
+    hotends_c = (setup.material.hotend_c if c is None else c for c in settings.hotends_c)
     bed_c = setup.material.bed_c if settings.bed_c is None else settings.bed_c
-    return hotend_c, min(bed_c, setup.printer.max_bed_c)
+    return tuple(hotends_c), min(bed_c, setup.printer.max_bed_c)
 
 
 def height_over(top_mm: float, state: ModalState, printer: PrinterProfile) -> float:
@@ -66,14 +67,27 @@ def height_over(top_mm: float, state: ModalState, printer: PrinterProfile) -> fl
 def filament_back_mm(job: Job) -> Float[np.ndarray, " m"]:
     """(m + 1,) filament that is back in the nozzle before each line of a job, and at its end.
 
-    Another filament is loaded as far as it has to be, by whatever changes it.
+    Another filament is loaded as far as it has to be, by whatever changes it; a head keeps its own.
     """
+    if job.nozzles > 1:
+        return _back_by_head_mm(job)
     pushed_mm = np.concatenate([[0.0], np.cumsum(job.moves()[1])])
     starts = [0, *(np.flatnonzero(np.diff(job.tools)) + 1), len(pushed_mm)]
     back_mm = np.empty(len(pushed_mm))
     for first, end in pairwise(starts):
         of_one_mm = pushed_mm[first:end]
         back_mm[first:end] = np.maximum.accumulate(of_one_mm) - of_one_mm
+    return back_mm
+
+
+def _back_by_head_mm(job: Job) -> Float[np.ndarray, " m"]:
+    pushed_mm, tools = job.moves()[1], job.tools
+    back_mm = np.zeros(len(tools))
+    for tool in np.unique(tools):
+        own_mm = np.where(tools[:-1] == tool, pushed_mm, 0.0)
+        so_far_mm = np.concatenate([[0.0], np.cumsum(own_mm)])
+        of_head_mm = np.maximum.accumulate(so_far_mm) - so_far_mm
+        back_mm[tools == tool] = of_head_mm[tools == tool]
     return back_mm
 
 
@@ -119,11 +133,12 @@ class Head:
         if settings.levelled and (mesh_again := dialect_of(self._printer.dialect).mesh_again):
             self.lines.append(mesh_again)
 
-    def heat(self, hotend_c: float, bed_c: float) -> None:
+    def heat(self, hotends_c: Sequence[float], bed_c: float) -> None:
         """Bed first, the nozzle above the bed's edge meanwhile.
 
         Of several heads the one that printed is taken before it is heated, as it may lie in its
-        dock; of several filaments to one nozzle a hot one takes its own.
+        dock, and each other one is as hot as the job had it, so that the job may take it at any
+        time; of several filaments to one nozzle a hot one takes its own.
         """
         x, y, _ = self._printer.park_mm
         docked = self._printer.docks
@@ -132,10 +147,19 @@ class Head:
             self.lines.append(f"G1 Z{number(self._clear_mm, 3)}{self._z_feed}")
         if bed_c > 0:
             self.lines.append(f"M140 S{number(bed_c, 1)}")
+        own, others = (
+            self._state.heater,
+            {k: number(c, 1) for k, c in enumerate(hotends_c) if c > 0},
+        )
+        hotend = others.pop(own, "0")
+        heats, waits = dialect_of(self._printer.dialect).head_heats
+        self.lines += [heats.format(k=k, c=target) for k, target in others.items()]
         self.lines.append(f"G1 X{number(x, 3)} Y{number(y, 3)}{self._travel}")
         if bed_c > 0:
             self.lines.append(f"M190 S{number(bed_c, 1)}")
-        self.lines += [f"M104 S{number(hotend_c, 1)}", f"M109 S{number(hotend_c, 1)}"]
+        self.lines.append(f"M104 S{hotend}")
+        self.lines += [waits.format(k=k, c=target) for k, target in others.items()]
+        self.lines.append(f"M109 S{hotend}")
         if self._state.tool and not docked:
             self.lines.append(f"T{self._state.tool}")
 

@@ -50,18 +50,38 @@ def lines_without(job: Job, first: int, name: str, printer: PrinterProfile) -> t
     Raises
     ------
     InputError
-        If there is no such object, or no other one.
+        If there is no such object, or no other one, or a head is changed amid what it would lay.
     """
     objects, index = object_named(job, name)
     lines = job.program.text.rstrip().split("\n")
     out: list[str] = []
     at = first
     for start, stop in _gaps(job, objects, index, first):
+        require_same_head(job, start, stop)
         out += lines[at:start]
         out += [line for line in lines[start:stop] if not MOVE_OR_ARC.match(line)]
         out += _across(job, start, stop, printer)
         at = stop
     return (*out, *lines[at:])
+
+
+def require_same_head(job: Job, start: int, stop: int) -> None:
+    """Refuse to pass over lines among which another head is taken.
+
+    What it and the one before pull back for that is in the moves that would be left out.
+
+    Raises
+    ------
+    InputError
+        If lines [start, stop) take another head.
+    """
+    tools = job.tools[start : stop + 1]
+    if job.nozzles > 1 and len(tools) and (tools != tools[0]).any():
+        line = start + int((tools != tools[0]).argmax())
+        raise InputError(
+            f"line {line} takes another head amid what would be left out, and how far each head's "
+            "filament is pulled back would not be known after it"
+        )
 
 
 def _gaps(job: Job, objects: JobObjects, index: int, first: int) -> Sequence[tuple[int, int]]:

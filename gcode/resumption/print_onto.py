@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gcode.check import CheckedProgram, check, policy_of
-from gcode.dialects import command_of, number
+from gcode.dialects import command_of, heaters_off, number
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
-from gcode.reader import Job, read_job
+from gcode.reader import Job, job_for
 from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
 from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import over_reach
@@ -75,31 +75,30 @@ def print_onto(
     CheckRefusedError
         If the checker refuses what comes out.
     """
-    job = read_job(
-        program, filament_diameter_mm=setup.printer.filament_diameter_mm, progress=progress
-    )
+    job = job_for(program, setup.printer, progress)
     raised_mm, uneven_mm = _height_under(job, standing)
     line = job.layers[0].first_line
     state, settings = job.state_after(line), settings_before(job, line)
     x, y, z = state.position_mm
     state = replace(state, position_mm=(x, y, z + raised_mm))
-    hotend_c, bed_c = temperatures(settings, setup)
+    hotends_c, bed_c = temperatures(settings, setup)
     head = Head(setup, state, clear_mm=height_over(standing.top_mm, state, setup.printer))
     head.comment(
         f"{title}, raised by {raised_mm:g} mm onto what stands there",
         "Z is not homed: the printer has been on all the time, or has been told its Z anew",
     )
     head.lift_and_home(settings)
-    head.heat(hotend_c, bed_c)
+    head.heat(hotends_c, bed_c)
     primed = prime(head, over_reach(standing, setup.printer), setup.printer)
     head.come_down(pulled_back_mm(job, line))
     head.restore(settings)
     lines = program.text.rstrip().split("\n")[line:]
     body = _raised(lines, raised_mm, absolute=state.absolute_xyz, first=line)
-    text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
+    off = heaters_off(program.dialect, setup.printer.nozzles)
+    text = "\n".join([*head.lines, *body, *off]) + "\n"
     whole = Program(text, program.dialect)
     checked = check(whole, setup, as_built=standing, policy=policy_of(program), progress=progress)
-    return Stacked(checked, raised_mm, uneven_mm, hotend_c, bed_c, primed)
+    return Stacked(checked, raised_mm, uneven_mm, hotends_c[state.heater], bed_c, primed)
 
 
 def _height_under(job: Job, standing: HeightField) -> tuple[float, float]:

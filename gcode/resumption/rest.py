@@ -24,7 +24,12 @@ from gcode.profiles import PrintSetup
 from gcode.reader import Job, JobObjects, objects_of, read_job
 from gcode.reader.objects import box_of_beads_mm
 from gcode.resumption.head import feed, filament_back_mm
-from gcode.resumption.leaving_out import LEAST_MOVE_MM, MOVE_OR_ARC, modes_as
+from gcode.resumption.leaving_out import (
+    LEAST_MOVE_MM,
+    MOVE_OR_ARC,
+    modes_as,
+    require_same_head,
+)
 from gcode.stretches import stretches_of
 from gcode.surfaces import HeightField
 
@@ -88,7 +93,7 @@ def rest_without(
     Raises
     ------
     InputError
-        If nothing would be left, or the job retracts by its firmware.
+        If nothing would be left, the job retracts by its firmware, or it changes heads over a gap.
     CheckRefusedError
         If what is left cannot be printed past what stands there.
     """
@@ -114,6 +119,7 @@ def rest_without(
     whole = read_job(
         Program(before + checked.program.text, job.program.dialect),
         filament_diameter_mm=job.filament_diameter_mm,
+        nozzles=job.nozzles,
     )
     return Rest(whole, checked, first, pen.line_of)
 
@@ -186,6 +192,7 @@ class _Pen:
             self._note(line)
             if not MOVE_OR_ARC.match(self._lines[line]):
                 self.text.append(self._lines[line])
+        require_same_head(self.job, start, stop)
         after, machine = self.job.state_after(stop), self.setup.printer
         more_mm = machine.retraction_mm - self.pulled_mm
         self.text += ["G90", "M83"]

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from gcode.check import CheckedProgram, check, policy_of
+from gcode.dialects import heaters_off
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
-from gcode.reader import Job, read_job
+from gcode.reader import Job, job_for
 from gcode.reader.job import JobLayer
 from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
 from gcode.resumption.leaving_out import lines_without
@@ -84,15 +85,14 @@ def resume_at(
     ReadError, CheckRefusedError
         If the job cannot be understood, or what would be printed is refused.
     """
-    diameter_mm = setup.printer.filament_diameter_mm
-    job = read_job(program, filament_diameter_mm=diameter_mm, progress=progress)
+    job = job_for(program, setup.printer, progress)
     progress("what stands", 0.0, 1.0)
     first = first_layer(job, z_mm, layer)
     line = first.first_line
     state, settings = job.state_after(line), settings_before(job, line)
     field = standing_field(job.beads, line, setup.printer)
     progress("what stands", 1.0, 1.0)
-    hotend_c, bed_c = temperatures(settings, setup)
+    hotends_c, bed_c = temperatures(settings, setup)
     head = Head(setup, state, clear_mm=height_over(field.top_mm, state, setup.printer))
     head.comment(
         f"{title}, from layer {first.index} on, whose top is at {first.z_mm:g} mm",
@@ -100,21 +100,22 @@ def resume_at(
         "Z is not homed: the printer has been on all the time, or has been told its Z anew",
     )
     head.lift_and_home(settings)
-    head.heat(hotend_c, bed_c)
+    head.heat(hotends_c, bed_c)
     primed = prime(head, field, setup.printer)
     head.come_down(pulled_back_mm(job, line))
     head.restore(settings)
     body: Sequence[str] = program.text.rstrip().split("\n")[line:]
     if without is not None:
         body = lines_without(job, line, without, setup.printer)
-    text = "\n".join([*head.lines, *body, "M104 S0", "M140 S0", "M107"]) + "\n"
+    off = heaters_off(program.dialect, setup.printer.nozzles)
+    text = "\n".join([*head.lines, *body, *off]) + "\n"
     whole = Program(text, program.dialect)
     return Resumption(
         checked=check(whole, setup, as_built=field, policy=policy_of(program), progress=progress),
         standing=field,
         layer=first,
         first_line=line,
-        hotend_c=hotend_c,
+        hotend_c=hotends_c[state.heater],
         bed_c=bed_c,
         primed=primed,
     )

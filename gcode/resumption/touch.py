@@ -21,7 +21,7 @@ from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrinterProfile, PrintSetup, ProbeProfile
 from gcode.progress import Progress, silent
-from gcode.reader import read_job
+from gcode.reader import job_for
 from gcode.reader.job import Beads, JobLayer
 from gcode.resumption.head import RESUME_LIFT_MM, feed, height_over
 from gcode.resumption.resume_at import first_layer
@@ -124,7 +124,7 @@ def plan_touch(
     """
     printer, options = setup.printer, TouchOptions()
     _refuse_impossible(printer, above_mm, options)
-    job = read_job(program, filament_diameter_mm=printer.filament_diameter_mm, progress=progress)
+    job = job_for(program, printer, progress)
     first = first_layer(job, z_mm, layer)
     last = job.layers[first.index - 1]
     places_mm, across_mm = _flat(job.beads, last, options)

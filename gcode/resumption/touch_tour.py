@@ -6,8 +6,6 @@ does, so one program cools it and another heats it again.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 
@@ -64,7 +62,7 @@ def tour(
         ]
     lines += [f"G1 Z{z}{down}", f"G1 X{x} Y{y}{travel}"]
     program = Program("\n".join(lines) + "\n", printer.dialect)
-    cold = replace(rest, hotend_c=0.0) if probe.kind == "nozzle" else rest
+    cold = rest.with_hotend(0.0) if probe.kind == "nozzle" else rest
     return check(program, setup, as_built=standing, initial=cold, touches=touches)
 
 
@@ -74,7 +72,9 @@ def cooled(setup: PrintSetup, rest: ModalState) -> CheckedProgram | None:
     if probe.kind != "nozzle" or rest.hotend_c <= 0:
         return None
     cold = number(max(probe.cold_c, rest.bed_c + ABOVE_BED_C), 0)
-    wait = [line.format(c=cold) for line in dialect_of(setup.printer.dialect).wait_to_cool]
+    sensor = f"extruder{rest.heater or ''}"
+    dialect = dialect_of(setup.printer.dialect)
+    wait = [line.format(c=cold, sensor=sensor) for line in dialect.wait_to_cool]
     lines = ["; cold, to touch", "M104 S0", "M106 S255", *wait, fan_command(rest.fan_ratio)]
     program = Program("\n".join(lines) + "\n", setup.printer.dialect)
     return check(program, setup, initial=rest)
@@ -86,4 +86,4 @@ def heated(setup: PrintSetup, rest: ModalState) -> CheckedProgram | None:
         return None
     text = f"; as hot as before\nM109 S{number(rest.hotend_c, 0)}\n"
     program = Program(text, setup.printer.dialect)
-    return check(program, setup, initial=replace(rest, hotend_c=0.0))
+    return check(program, setup, initial=rest.with_hotend(0.0))

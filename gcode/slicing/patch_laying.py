@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
+from gcode.dialects import heaters_off
 from gcode.errors import SliceError
 from gcode.moves import (
     Comment,
@@ -124,6 +125,8 @@ def end(
     pen.add(SetHotend(0.0))
     pen.add(SetBed(0.0))
     pen.add(SetFan(0.0))
+    if printer.docks:
+        pen.add(Script(tuple(heaters_off(printer.dialect, printer.nozzles)), "every head"))
 
 
 def after_first(pen: Pen, setup: PrintSetup, hotend_c: float) -> None:

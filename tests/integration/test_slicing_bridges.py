@@ -29,7 +29,7 @@ from tests.integration.test_slicing_patch import motion_of
 SETUP = load_setup()
 LIMIT_MM = SETUP.material.max_bridge_mm
 PARK = (10.0, 200.0, 20.0)
-HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
 FOOT_MM, WIDE_MM, LEG_MM, MIDDLE = 7.0, 6.0, 4.0, (75.0, 75.0)
 HOLD_MM = 0.9  # no bead ends farther over air than two lines' widths
 

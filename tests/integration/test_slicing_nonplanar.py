@@ -18,7 +18,7 @@ from tests.gcode_text import beads_of, points_of, steps_of
 from tests.judge import Verdict, judge
 
 PARK = (10.0, 200.0, 20.0)
-HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
 MIDDLE_MM, HIGH_MM = 75.0, 6.0
 
 

@@ -27,7 +27,7 @@ SETUP = load_setup()
 TOP_MM = 4.0
 BLOCK = m3.Manifold.cube((30.0, 30.0, TOP_MM)).translate((60.0, 60.0, 0.0))
 PARK = (10.0, 200.0, 20.0)
-HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
 AREA_MM2 = np.pi / 4 * 1.75**2
 
 

@@ -30,7 +30,7 @@ TOP_MM = 4.0
 BLOCK = m3.Manifold.cube((30.0, 30.0, TOP_MM)).translate((60.0, 60.0, 0.0))
 PARK = (10.0, 200.0, 20.0)
 JOB_C = 207.5
-HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, JOB_C, 60.0)
+HOT = ModalState(PARK, 0.0, True, False, 50.0, 1.0, (JOB_C,), 60.0)
 WRITTEN_MM = 2e-3  # of what is written to a micrometre, and of doubles
 
 

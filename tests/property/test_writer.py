@@ -97,7 +97,7 @@ def test_an_interruption_leaves_the_machine_as_it_was(
 
 
 def test_the_nozzle_goes_across_high_before_it_comes_down() -> None:
-    state = ModalState((50.0, 60.0, 1.2), 0.0, True, False, 30.0, 0.5, 210.0, 60.0)
+    state = ModalState((50.0, 60.0, 1.2), 0.0, True, False, 30.0, 0.5, (210.0,), 60.0)
     away = np.array([[5.0, 200.0, 20.0]])
     text = write(Toolpath((Travel(away, 100.0),)), SETUP, title="t", resume=state).text
     moves = [line for line in text.splitlines() if line.startswith("G1 ")]

@@ -46,7 +46,7 @@ M140 S0
 M107
 M84
 """
-MID = ModalState((60.0, 60.0, 5.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+MID = ModalState((60.0, 60.0, 5.0), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
 
 
 def program(text: str) -> Program:
@@ -273,7 +273,7 @@ def test_a_cold_machine_may_wait_and_a_hot_one_soak_before_the_first_bead() -> N
 
 @pytest.mark.parametrize(("z_mm", "said"), [(4.0, "homing X or Y below"), (5.0, None)])
 def test_x_and_y_are_homed_above_all_that_stands(z_mm: float, said: str | None) -> None:
-    start = ModalState((60.0, 60.0, z_mm), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    start = ModalState((60.0, 60.0, z_mm), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
     found = find_refusals(
         program("G28 X Y\n"), SETUP, as_built=standing(5.0, 80.0, 84.0), initial=start
     )
@@ -387,7 +387,7 @@ def travel(x0: float, x1: float, z: float) -> str:
 
 def test_a_travel_into_the_part_is_refused_and_one_above_it_passes() -> None:
     wall = standing(10.0, 80.0, 84.0)
-    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
     low, high = travel(60, 100, 9.0), travel(60, 100, 10.5)
     refusals = find_refusals(program(low), SETUP, as_built=wall, initial=start)
     assert any("hits what stands there" in r.what for r in refusals)
@@ -398,7 +398,7 @@ def test_a_travel_into_the_part_is_refused_and_one_above_it_passes() -> None:
 def test_the_nozzle_is_a_cone(beside_mm: float, hits: bool) -> None:
     # regression: beside a wall 0.6 mm higher than the tip it counted as no wider than its flat
     wall = standing(10.0, 80.0, 84.0)
-    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
     x = 80.0 - beside_mm
     along = f"G1 X{x} Y60 Z9.4 F3000\nG1 X{x} Y70\n"
     refusals = find_refusals(program(along), SETUP, as_built=wall, initial=start)
@@ -409,7 +409,7 @@ def test_the_nozzle_is_a_cone(beside_mm: float, hits: bool) -> None:
 def test_the_heater_block_is_a_body_too(gap: float, hits: bool) -> None:
     # the tip stays beside a wall 7 mm higher: the block, 4.5 mm above the tip, must not meet it
     wall = standing(8.0, 80.0, 84.0)
-    start = ModalState((10.0, 60.0, 30.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    start = ModalState((10.0, 60.0, 30.0), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
     x = 80.0 - gap
     text = f"G1 X{x} Y60 F3000\nG1 Z1 F600\n"
     refusals = find_refusals(program(text), SETUP, as_built=wall, initial=start)
@@ -420,7 +420,7 @@ def test_the_heater_block_is_a_body_too(gap: float, hits: bool) -> None:
 
 def test_what_is_laid_stands_in_the_way_of_what_follows() -> None:
     bare = HeightField.flat((150.0, 150.0), 0.25)
-    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+    start = ModalState((60.0, 60.0, 20.0), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
     tower = "".join(f"G1 Z{0.2 * k:.1f} F600\nG1 X{70 - 10 * (k % 2)} E0.4 F1200\n"
                     for k in range(1, 12))  # fmt: skip
     through = tower + "G1 X65 Y70 F6000\nG1 Z0.4 F600\nG1 Y50 F6000\n"

@@ -17,7 +17,7 @@ from gcode.moves import ModalState, Program
 from gcode.profiles import load_setup
 
 SETUP = load_setup()
-MID = ModalState((60.0, 60.0, 5.0), 0.0, True, False, 50.0, 1.0, 210.0, 60.0)
+MID = ModalState((60.0, 60.0, 5.0), 0.0, True, False, 50.0, 1.0, (210.0,), 60.0)
 NUMBERS = st.one_of(
     st.floats(-30.0, 260.0).map(lambda v: f"{v:.3f}"),
     st.floats(-1.0, 4.0).map(lambda v: f"{v:.5f}"),

@@ -275,7 +275,7 @@ def test_a_job_that_uses_one_of_several_heads_is_judged(
         (f"{START}\nM104 T4 S200", END, "hotend of another tool: T4"),
         (f"{START}\nT1", END, "cold extrusion"),  # the first was heated, the second prints
         (f"{START}\nM109 T1 S210\nM104 T1 S20\nT1", END, "cold extrusion"),
-        (START, f"T1\n{END}", "change of tool or filament: T1, limit T0, as it began"),
+        (START, f"T1\nG1 X60 Y60\nG1 X70 E.2\n{END}", "cold extrusion"),
     ],
 )
 def test_heads_that_do_not_print_are_watched_too(start: str, end: str, said: str) -> None:

@@ -59,12 +59,13 @@ _HOMES_Z = re.compile(r"^[ \t]*G28[ \t]*(?:;.*)?$|^[ \t]*G28\b[^;\n]*Z", re.MULT
 def heads_of(settings: Mapping[str, str]) -> tuple[int, bool]:
     """How many heads there are, and whether they are filaments to one nozzle.
 
-    There are as many as nozzles, as scripts name, and as filaments were loaded.
+    There are as many as nozzles and as filaments were loaded; of one nozzle as scripts name. Those
+    of several may name more, as they are written for a maker's largest machine.
     """
     nozzles, loaded = _told_for(settings)
     texts = list(_scripts(settings))
     tools = (int(tool) for text in texts for tool in _CHOSEN.findall(text))
-    named = [1 + tool for tool in tools if tool < MOST_HEADS]
+    named = [1 + tool for tool in tools if tool < MOST_HEADS and nozzles == 1]
     shared = settings.get("single_extruder_multi_material", "0") == "1"
     heated = any(_HEATED.search(text) for text in texts)
     one_nozzle = not heated and (shared or nozzles == 1)
