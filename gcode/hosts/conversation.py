@@ -21,6 +21,7 @@ from typing import NoReturn, TypeVar
 
 import serial
 
+from gcode.dialects import dialect_of
 from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.journal import Journal
 from gcode.hosts.port import Capabilities, LinkLostError, Temperatures
@@ -96,6 +97,7 @@ class SerialConversation:
         self._capabilities = Capabilities("")
         self._position: ev.PositionReport | None = None
         self._temperatures: ev.TemperatureReport | None = None
+        self._heads: set[int] = set()  # that reports told of, where there are several
         self._asked = {"M114": 0, "M115": 0}
         self._heard = {"M114": 0, "M115": 0}
         self._failure: Exception | None = None
@@ -217,6 +219,7 @@ class SerialConversation:
 
     def _learn(self) -> None:
         self._capabilities = Capabilities.told(self._ask("M115"))
+        self._ask("M105")  # of which heads it tells
 
     def _log_wire(self, direction: bytes, data: bytes) -> None:
         if self._log is not None:
@@ -236,17 +239,29 @@ class SerialConversation:
     def temperatures(self) -> Temperatures:
         """Ask for temperatures (M105)."""
         report = self._answer("M105", lambda: self._temperatures, "temperatures")
-        heaters = report.heaters
-        hotend = heaters.get("T") or heaters.get("T0")
+        hotend, bed = report.hotend, report.heaters.get("B")
         if hotend is None:
             raise LinkError("The printer reports no hotend temperature; check its firmware.")
-        bed = heaters.get("B")
         return Temperatures(
             hotend.current_c,
             hotend.target_c or 0.0,
             bed.current_c if bed else None,
             (bed.target_c or 0.0) if bed else None,
+            tuple(heater.target_c or 0.0 for _, heater in sorted(report.heads.items())),
         )
+
+    @property
+    def heads(self) -> int:
+        """How many heads the printer tells of, each heated by itself."""
+        return max(self._heads, default=0) + 1
+
+    def heads_off(self) -> tuple[str, ...]:
+        """Lines that switch off each of several heads that the printer has ever told of.
+
+        Its word for the hotend means the one that is chosen.
+        """
+        word = dialect_of(self._link.dialect.name).head_off
+        return tuple(word.format(k=k) for k in sorted(self._heads))
 
     def position_mm(self) -> tuple[float, float, float]:
         """Ask for the logical position (M114)."""
@@ -422,6 +437,8 @@ class SerialConversation:
             return
         if isinstance(event, ev.TemperatureReport):
             self._temperatures = event
+            if len(event.heads) > 1:
+                self._heads |= event.heads.keys()
         elif isinstance(event, ev.PositionReport):
             self._position = event
             self._heard["M114"] += 1

@@ -74,7 +74,9 @@ class GuardedConversation(SerialConversation):
             self.close()
             raise
         if self._line.supervise:
-            self._supervisor = Supervisor(self._fd, self._lock.fd, self._journal_path())
+            self._supervisor = Supervisor(
+                self._fd, self._lock.fd, self._journal_path(), self.heads_off()
+            )
 
     def _journal_path(self) -> Path | None:
         return self._journal.path if self._journal is not None else None
@@ -94,7 +96,7 @@ class GuardedConversation(SerialConversation):
         try:
             before_hello(number)
         except LinkError:
-            self._told_safe(make_safe(self._fd))
+            self._told_safe(make_safe(self._fd, heads_off=self.heads_off()))
             raise
 
     def close(self) -> None:
@@ -124,8 +126,8 @@ class GuardedConversation(SerialConversation):
         self._link.give_up(self._ended_by, stopped=True)
 
     def heaters_off(self) -> None:
-        """Switch hotend, bed and fan off, acknowledged."""
-        for command in SAFE_COMMANDS:
+        """Switch every hotend, bed and fan off, acknowledged."""
+        for command in (*SAFE_COMMANDS, *self.heads_off()):
             self._ask(command)
 
     def make_safe(self) -> None:
@@ -167,7 +169,7 @@ class GuardedConversation(SerialConversation):
             self._ended_by = "the printer was made safe"
             self._link.give_up(self._ended_by)
         waits = self._link.slow_under_way
-        word = make_safe(self._fd, lift=lift)
+        word = make_safe(self._fd, lift=lift, heads_off=self.heads_off())
         if waits and word.endswith("NO ANSWER"):
             word += (
                 ": the printer is at a command that takes long, heats on until that is done, and "
@@ -182,7 +184,7 @@ class GuardedConversation(SerialConversation):
             self._lift()
             self._told_safe(f"{self._heaters_now()}, nozzle lifted")
         except JournalError:  # numbered lines must be written down first, these need not
-            self._told_safe(make_safe(self._fd))
+            self._told_safe(make_safe(self._fd, heads_off=self.heads_off()))
         except LinkError:
             return False
         return True

@@ -181,8 +181,7 @@ class JobBook:
 
     def temperature(self, report: TemperatureReport) -> None:
         """Write temperatures down, some of the many that come while something heats."""
-        heaters = report.heaters
-        hotend, bed = heaters.get("T") or heaters.get("T0"), heaters.get("B")
+        hotend, bed = report.hotend, report.heaters.get("B")
         if self._journal is None or hotend is None:
             return
         now_s = self._clock()

@@ -13,6 +13,8 @@ from gcode.dialects import WORD, command_of, dialect_of
 from gcode.hosts.port import PrintableProgram
 from gcode.protocol import command_in
 
+_HEAD_NAME = re.compile(r"T(\d{1,3})")
+_EXTRUDER_NAME = re.compile(r"EXTRUDER(\d{0,3})")
 _TOUCH_LINE = re.compile(r"G38\.2\s+Z(?P<to>[-+.\d]+)|AMREPAIR_TOUCH\s+DEPTH=(?P<by>[.\d]+)")
 
 
@@ -23,7 +25,17 @@ GO_MM_MIN, LIFT_MM_MIN = 6000, 600
 
 @dataclass(frozen=True, slots=True)
 class Modes:
-    """Modal state of a machine; positions are logical, as M114 tells them, None if unknown."""
+    """Modal state of a machine; positions are logical, as M114 tells them, None if unknown.
+
+    Attributes
+    ----------
+    hotend_c
+        Target of the only heater, where there is one.
+    heads_c
+        The same by head, where there are several.
+    tool
+        The head that is chosen.
+    """
 
     absolute: bool = True
     absolute_e: bool = True
@@ -31,8 +43,29 @@ class Modes:
     feed_mm_min: float | None = None
     position_mm: dict[str, float] = field(default_factory=dict)
     hotend_c: float = 0.0
+    heads_c: dict[int, float] = field(default_factory=dict)
+    tool: int = 0
     bed_c: float = 0.0
     fan: float = 0.0  # 0..255
+
+    def targets_c(self, heads: int) -> tuple[float, ...]:
+        """What each of so many heads is told to be at."""
+        if heads < 2:
+            return (self.hotend_c,)
+        return tuple(self.heads_c.get(head, 0.0) for head in range(heads))
+
+    def heating(self, heads: int, dialect: str) -> list[str]:
+        """Lines that heat every head that is on, and wait for it; the one that is chosen last."""
+        targets_c = self.targets_c(heads)
+        own = self.tool if heads > 1 else 0
+        heats, waits = dialect_of(dialect).head_heats
+        others = {k: f"{c:g}" for k, c in enumerate(targets_c) if c > 0 and k != own}
+        lines = [heats.format(k=k, c=c) for k, c in others.items()]
+        hot = own < len(targets_c) and targets_c[own] > 0
+        if hot:
+            lines.append(f"M104 S{targets_c[own]:g}")
+        lines += [waits.format(k=k, c=c) for k, c in others.items()]
+        return [*lines, f"M109 S{targets_c[own]:g}"] if hot else lines
 
     def restore(self, x_mm: float, y_mm: float, z_mm: float, e_mm: float) -> tuple[str, ...]:
         """Commands that bring the machine to a place and back into these modes."""
@@ -99,8 +132,14 @@ def follow(modes: Modes, text: str, dialect: str) -> Modes:
     touch = _TOUCH_LINE.match(f"{name} {rest}")
     if touch is not None:
         return _touched(modes, touch)
+    if (head := _HEAD_NAME.fullmatch(name)) is not None:
+        e_mm = (
+            {"E": 0.0} if dialect_of(dialect).tool_zeroes_e and int(head[1]) != modes.tool else {}
+        )
+        place = {**modes.position_mm, **e_mm}
+        return replace(modes, tool=int(head[1]), position_mm=place)
     if name[:1] not in ("G", "M"):
-        return modes
+        return _named(modes, name, rest, dialect)
     words = {letter: float(value) for letter, value in WORD.findall(rest)}
     if name in ("G0", "G1", "G2", "G3"):
         return _move(modes, words, g91_moves_e=dialect_of(dialect).g91_moves_e)
@@ -135,11 +174,37 @@ def _touched(modes: Modes, touch: re.Match[str]) -> Modes:
     return replace(modes, position_mm=place)
 
 
+def _named(modes: Modes, name: str, rest: str, dialect: str) -> Modes:
+    """Klipper's commands of heads and heaters."""
+    told = dict(word.partition("=")[::2] for word in rest.split())
+    if name == "TURN_OFF_HEATERS":
+        return replace(modes, hotend_c=0.0, heads_c={}, bed_c=0.0)
+    key = {"SET_HEATER_TEMPERATURE": "HEATER", "ACTIVATE_EXTRUDER": "EXTRUDER"}.get(name, "")
+    head = _EXTRUDER_NAME.fullmatch(told.get(key, ""))
+    if name == "ACTIVATE_EXTRUDER" and head is not None:
+        return follow(modes, f"T{head[1] or 0}", dialect)
+    target = WORD.fullmatch(f"S{told.get('TARGET', '0')}")
+    if name != "SET_HEATER_TEMPERATURE" or target is None:
+        return modes
+    if told.get(key) == "HEATER_BED":
+        return replace(modes, bed_c=float(target[2]))
+    return modes if head is None else _hotend(modes, float(head[1] or 0), float(target[2]))
+
+
+def _hotend(modes: Modes, told: float | None, target_c: float) -> Modes:
+    """A head's target; of the only heater a line may say the number of the head that is chosen."""
+    head = modes.tool if told is None else int(told)
+    alone_c = target_c if head in (0, modes.tool) else modes.hotend_c
+    return replace(modes, hotend_c=alone_c, heads_c={**modes.heads_c, head: target_c})
+
+
 def _heat(modes: Modes, name: str, words: dict[str, float]) -> Modes:
     """Heaters and the part's fan (further ones have a P)."""
     value = words.get("S", words.get("R"))
     if name in ("M104", "M109") and value is not None:
-        return replace(modes, hotend_c=value)
+        return _hotend(modes, words.get("T"), value)
+    if name in ("G10", "M568") and "S" in words and "P" in words:  # RepRapFirmware's
+        return _hotend(modes, words["P"], max(words["S"], 0.0))
     if name in ("M140", "M190") and value is not None:
         return replace(modes, bed_c=value)
     if name == "M106" and not words.get("P"):

@@ -88,9 +88,18 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         wanted: dict[str, list[str] | None] = {
             "extruder": ["temperature", "target"],
             "heater_bed": ["temperature", "target"],
+            "toolhead": ["extruder"],
+            "heaters": ["available_heaters"],
         }
         status = self._session.query(wanted)
-        hotend, bed = status.get("extruder", {}), status.get("heater_bed", {})
+        there = status.get("heaters", {}).get("available_heaters", ())
+        named = ["extruder", *(f"extruder{k}" for k in range(1, len(there)))]
+        names = [name for name in named if name in there]
+        if len(names) > 1:
+            wanted = {name: ["temperature", "target"] for name in names}
+            status |= self._session.query(wanted)
+        chosen = str(status.get("toolhead", {}).get("extruder") or "extruder")
+        hotend, bed = status.get(chosen, {}), status.get("heater_bed", {})
         if "temperature" not in hotend:
             raise LinkError(f"{self.address.name} reports no [extruder]; check printer.cfg.")
         return Temperatures(
@@ -98,6 +107,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
             float(hotend.get("target") or 0.0),
             float(bed["temperature"]) if "temperature" in bed else None,
             float(bed.get("target") or 0.0) if "temperature" in bed else None,
+            tuple(float(status[name].get("target") or 0.0) for name in names if len(names) > 1),
         )
 
     def position_mm(self) -> tuple[float, float, float]:

@@ -17,7 +17,7 @@ from gcode.hosts.moonraker import MoonrakerPrinter
 from gcode.hosts.moonraker_session import MoonrakerSession
 from gcode.hosts.moonraker_state import STOPPED, cause_of
 from gcode.hosts.port import NothingMetError, PrintableProgram
-from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
+from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, either_c, number_of
 from gcode.hosts.server import ServerReach
 from gcode.hosts.web import LIFT_COMMANDS
 from gcode.progress import Progress, silent
@@ -188,12 +188,18 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
             raise self._in_doubt(told["done"], told["begun"])
         return max(lines.start, min(told["done"], lines.stop))
 
-    def _heat_of_before(self) -> tuple[float, float]:
-        told = self._steps()
-        return float(told["hotend"]), float(told["bed"])
+    def _heat_of_before(self) -> tuple[tuple[float, ...], float]:
+        told = self._macro()
+        hotends = told.get("hotend") or 0  # of several heads a list
+        each = hotends if isinstance(hotends, list) else [hotends]
+        return tuple(float(c) for c in each), float(told.get("bed") or 0)
 
     def _steps(self) -> dict[str, int]:
         """What the printer's macro has counted."""
+        told = self._macro()
+        return {name: int(told.get(name) or 0) for name in ("program", "begun", "done")}
+
+    def _macro(self) -> dict[str, Any]:
         key = f"gcode_macro {STEP_MACRO}"
         told = self._session.query({key: None}).get(key)
         if told is None:
@@ -201,8 +207,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
                 f"the printer behind {self.address.name} has no macro {STEP_MACRO}; include "
                 "amrepair.cfg ('amrepair agent --macros') in printer.cfg and restart Klipper."
             )
-        return {name: int(told.get(name) or 0) for name in ("program", "begun", "done", "hotend",
-                                                            "bed")}  # fmt: skip
+        return told
 
     def pulled_at_rest_mm(self) -> float:
         """Filament that the user's `PAUSE` has pulled back, as our macros measured it."""
@@ -288,11 +293,12 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
         if state.busy:
             if not self._rest()[0]:
                 return
-            now, (hotend_c, bed_c) = self.temperatures(), self._heat_at_look
-            was = {"hotend": now.hotend_target_c or hotend_c, "bed": now.bed_target_c or bed_c}
-            for name, value in was.items():
-                if value:
-                    self.command(_set_step(name, round(value)))
+            now, (hotends_c, bed_c) = self.temperatures(), self._heat_at_look
+            each = [round(c) for c in either_c(now.hotend_targets_c, hotends_c)]
+            was = {"hotend": each, "bed": [round(now.bed_target_c or bed_c)]}
+            for name, values in was.items():
+                if any(values):
+                    self.command(_set_step(name, *values))
         super().heaters_off()
 
     # ------------------------------------------------------------------ macros
@@ -307,6 +313,7 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
         return found
 
 
-def _set_step(name: str, value: int) -> str:
-    """The command that keeps a number with the printer."""
+def _set_step(name: str, *values: int) -> str:
+    """The command that keeps a number, or several, with the printer."""
+    value = ",".join(map(str, values))  # of several Klipper makes a tuple
     return f"SET_GCODE_VARIABLE MACRO={STEP_MACRO} VARIABLE={name} VALUE={value}"

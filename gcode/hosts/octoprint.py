@@ -7,6 +7,7 @@ in a pause is left to the server's own pause script, which knows where its queue
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
@@ -96,10 +97,14 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         if pairs.get("tool0", (None,))[0] is None:
             for reply in self._session.ask("M105"):
                 if isinstance(reply, ev.TemperatureReport):
-                    names = {"T": "tool0", "T0": "tool0", "B": "bed"}
+                    names = {"T": "tool0", "B": "bed"} | {f"T{k}": f"tool{k}" for k in reply.heads}
                     for name, heater in reply.heaters.items():
                         pairs[names.get(name, name)] = (heater.current_c, heater.target_c)
-        hotend_c, hotend_target_c = pairs.get("tool0", (None, None))
+        tools = [pairs[f"tool{k}"] for k in range(len(pairs)) if f"tool{k}" in pairs]
+        # which is chosen OctoPrint does not tell
+        hotend_c, hotend_target_c = max(
+            tools, key=lambda pair: pair[1] or 0.0, default=(None, None)
+        )
         bed_c, bed_target_c = pairs.get("bed", (None, None))
         if hotend_c is None:
             raise LinkError(f"The printer of {self.address.name} reports no hotend temperature.")
@@ -108,6 +113,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
             float(hotend_target_c or 0.0),
             float(bed_c) if bed_c is not None else None,
             float(bed_target_c or 0.0) if bed_c is not None else None,
+            tuple(float(target_c or 0.0) for _, target_c in tools) if len(tools) > 1 else (),
         )
 
     def position_mm(self) -> tuple[float, float, float]:
@@ -233,5 +239,10 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self._session.command("M112")
 
     def heaters_off(self) -> None:
-        """Switch hotend, bed and fan off, acknowledged."""
+        """Switch every hotend, bed and fan off, acknowledged."""
         self._session.ask(*SAFE_COMMANDS)
+        heads = 0
+        with contextlib.suppress(LinkError):  # it reports no temperature
+            heads = len(self.temperatures().targets_c)
+        if heads:  # its word for the hotend means the one that is chosen
+            self._session.ask(*(f"M104 T{k} S0" for k in range(heads)))

@@ -289,9 +289,9 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
                 return
             self.wait(self._timing.poll_s)
 
-    def _heat_of_before(self) -> tuple[float, float]:
+    def _heat_of_before(self) -> tuple[tuple[float, ...], float]:
         told = part_of(self._asked_about, "heat")
-        return float(told.get("hotend") or 0.0), float(told.get("bed") or 0.0)
+        return tuple(float(c) for c in told.get("hotends") or ()), float(told.get("bed") or 0.0)
 
     # ------------------------------------------------------------------ pause, safety
 
@@ -317,8 +317,8 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
         told = part_of(self._state(), "print")
         if told and not told.get("ended") and not told.get("rests"):
             return
-        hotend_c, bed_c = self._heat_at_look
-        self._tell("off", hotend=hotend_c, bed=bed_c)
+        hotends_c, bed_c = self._heat_at_look
+        self._tell("off", hotends=list(hotends_c), bed=bed_c)
 
     def leave(self, way_back: Sequence[PrintableProgram]) -> None:
         """What leads back to the job, for somebody who lets it go on without us.

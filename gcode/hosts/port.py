@@ -33,12 +33,27 @@ class PrintableProgram(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Temperatures:
-    """Current and target temperatures, °C; the bed is None where there is none."""
+    """Current and target temperatures, °C; the bed is None where there is none.
+
+    Attributes
+    ----------
+    hotend_c, hotend_target_c
+        Of the head that is chosen; where the printer does not tell which, of the one that is told
+        to be hottest.
+    targets_c
+        Of each of several heads.
+    """
 
     hotend_c: float
     hotend_target_c: float
     bed_c: float | None
     bed_target_c: float | None
+    targets_c: tuple[float, ...] = ()
+
+    @property
+    def hotend_targets_c(self) -> tuple[float, ...]:
+        """By head, as many as there are."""
+        return self.targets_c or (self.hotend_target_c,)
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,8 +78,9 @@ def rejoin(
         modes = modes_after(program, end, dialect, first=first, modes=modes)
     idle_s = 0.0 if ended_s is None else wall_clock() - ended_s
     require_as_left(
-        printer, modes, refused, release_c=release_c, pose_confirmed=pose_confirmed, idle_s=idle_s
-    )
+        printer, modes, refused, dialect=checked.program.dialect, release_c=release_c,
+        pose_confirmed=pose_confirmed, idle_s=idle_s,
+    )  # fmt: skip
     return None if done else report
 
 
@@ -88,6 +89,7 @@ def require_as_left(
     modes: Modes,
     refused: Callable[[str], ResumeRefusedError],
     *,
+    dialect: str,
     release_c: float,
     pose_confirmed: bool,
     idle_s: float = 0.0,
@@ -100,6 +102,8 @@ def require_as_left(
         As it was left; places that are not known there are not compared.
     refused
         Makes the error of a reason.
+    dialect
+        In whose words heads are heated.
     idle_s
         How long it has rested.
     """
@@ -122,13 +126,15 @@ def require_as_left(
                 f"the bed is at {bed_c:.1f} °C, below the {release_c:g} °C at which this material "
                 f"lets go; {hint}"
             )
-    _heat(printer, modes)
+    _heat(printer, modes, dialect)
 
 
-def _heat(printer: ServerPrinter[Any], modes: Modes) -> None:
+def _heat(printer: ServerPrinter[Any], modes: Modes, dialect: str) -> None:
     """Heat again what was switched off since."""
     now = printer.temperatures()
     if modes.bed_c > 0 and now.bed_target_c != modes.bed_c:
         printer.command(f"M190 S{modes.bed_c:g}")
-    if modes.hotend_c > 0 and now.hotend_target_c != modes.hotend_c:
-        printer.command(f"M109 S{modes.hotend_c:g}")
+    told_c = modes.targets_c(len(now.hotend_targets_c))
+    if any(c > 0 and c != is_c for c, is_c in zip(told_c, now.hotend_targets_c, strict=True)):
+        for line in modes.heating(len(told_c), dialect):
+            printer.command(line)

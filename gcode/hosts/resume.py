@@ -349,13 +349,11 @@ class _Resumption:
             lift_mm = max(PAUSE_LIFT_MM, known["Z"] - place.z_mm)
             for command in ("G91", f"G1 Z{lift_mm:.3f} F600", "G90"):
                 tell(command)
-        for heat, wait, target_c in (
-            ("M140", "M190", modes.bed_c),
-            ("M104", "M109", modes.hotend_c),
-        ):
-            if target_c > 0:
-                tell(f"{heat} S{target_c:g}")
-                tell(f"{wait} S{target_c:g}")
+        if modes.bed_c > 0:
+            tell(f"M140 S{modes.bed_c:g}")
+            tell(f"M190 S{modes.bed_c:g}")
+        for command in modes.heating(self._printer.heads, self._printer.dialect.name):
+            tell(command)
         tell(f"M106 S{modes.fan:g}" if modes.fan > 0 else "M107")
         e_mm = known.get("E", place.e_mm) if modes.absolute_e else place.e_mm
         for command in modes.restore(known["X"], known["Y"], known["Z"], e_mm):

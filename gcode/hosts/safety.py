@@ -17,7 +17,7 @@ from pathlib import Path
 import gcode
 
 SAFE_COMMANDS = ("M104 S0", "M140 S0", "M107")
-"""Heaters and fan off."""
+"""The present head's heater, the bed's and the fan off."""
 
 FAREWELL = b"."
 _TIMEOUT_S = 5.0
@@ -26,7 +26,13 @@ _TIMEOUT_S = 5.0
 class Supervisor:
     """Our end of the supervisor process."""
 
-    def __init__(self, port_fd: int, lock_fd: int | None, journal: Path | None) -> None:
+    def __init__(
+        self,
+        port_fd: int,
+        lock_fd: int | None,
+        journal: Path | None,
+        heads_off: tuple[str, ...] = (),
+    ) -> None:
         ours, theirs = os.pipe()
         fds = [ours, port_fd] + ([lock_fd] if lock_fd is not None else [])
         root = str(Path(gcode.__file__).parent.parent)
@@ -39,6 +45,7 @@ class Supervisor:
                 str(ours),
                 str(port_fd),
                 str(journal or ""),
+                *heads_off,
             ],
             pass_fds=fds,
             stdin=subprocess.DEVNULL,

@@ -16,6 +16,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, TypeVar
 from urllib.parse import quote
 
@@ -59,8 +60,8 @@ class ServedJob(ServerPrinter[Session]):
     """What is printed in the place of the job's last lines."""
     _name = _sha256 = ""
     _joining = False
-    _heat_at_look = (0.0, 0.0)
-    """What hotend and bed were set to as the job came to rest; 0 where that is not known."""
+    _heat_at_look: tuple[tuple[float, ...], float] = ((), 0.0)
+    """What each head and the bed were set to as the job came to rest; 0 where that is not known."""
     _held_back: threading.Event
 
     # ------------------------------------------------------------------ of each server
@@ -132,8 +133,8 @@ class ServedJob(ServerPrinter[Session]):
         """Return when nothing that was sent is under way."""
 
     @abstractmethod
-    def _heat_of_before(self) -> tuple[float, float]:
-        """What hotend and bed were set to when they were switched off; 0 where they were not."""
+    def _heat_of_before(self) -> tuple[tuple[float, ...], float]:
+        """What heads and bed were set to when they were switched off; 0 where they were not."""
 
     def _text_of(self, data: bytes) -> JobText:
         return JobText(data)
@@ -242,7 +243,7 @@ class ServedJob(ServerPrinter[Session]):
             if rests and self._text.is_look(line):
                 if line == end:
                     now = self._asked(self.temperatures)
-                    self._heat_at_look = (now.hotend_target_c, now.bed_target_c or 0.0)
+                    self._heat_at_look = (now.hotend_targets_c, now.bed_target_c or 0.0)
                     return True
                 if line < end:
                     self._go_on(line, max(first, line))
@@ -293,7 +294,10 @@ class ServedJob(ServerPrinter[Session]):
                 f"The job on {self.address.name} cannot be gone on with: {why}.", first - 1, end - 1
             )
 
-        require_as_left(self, modes, refuse, release_c=release_c, pose_confirmed=pose_confirmed)
+        require_as_left(
+            self, modes, refuse, dialect=checked.program.dialect, release_c=release_c,
+            pose_confirmed=pose_confirmed,
+        )  # fmt: skip
 
     def _lift_to(self, modes: Modes) -> None:
         """Straight up from a touch to where the touches began, and there."""
@@ -317,13 +321,14 @@ class ServedJob(ServerPrinter[Session]):
                 of_job, at_look = _after(program, first, end, of_job), Modes(hotend_c=math.nan)
             else:
                 at_look = _after(program, first, end, at_look)
-        hotend_c, bed_c = self._heat_of_before()
-        self._heat_at_look = (hotend_c or of_job.hotend_c, bed_c or of_job.bed_c)
-        now = self.temperatures()
+        now, (hotends_c, bed_c) = self.temperatures(), self._heat_of_before()
+        each_c = of_job.targets_c(len(now.hotend_targets_c))
+        self._heat_at_look = (either_c(hotends_c, each_c), bed_c or of_job.bed_c)
         if bed_c and not now.bed_target_c:
             self.command(f"M140 S{bed_c:g}")
-        if hotend_c and not now.hotend_target_c and at_look.hotend_c != 0:
-            self.command(f"M109 S{hotend_c:g}")
+        if at_look.hotend_c != 0:
+            for line in heated_again(hotends_c, now.hotend_targets_c):
+                self.command(line)
 
     def _asked(self, ask: Callable[[], Answer]) -> Answer:
         """Ask; a server that went away gets time to come back."""
@@ -351,6 +356,24 @@ class ServedJob(ServerPrinter[Session]):
             "look: which of them it has carried out is not known, and none is printed twice.",
             first - 1, after - 1,
         )  # fmt: skip
+
+
+def either_c(first: Sequence[float], other: Sequence[float]) -> tuple[float, ...]:
+    """By head, what one tells of it, or else the other."""
+    return tuple(a or b for a, b in zip_longest(first, other, fillvalue=0.0))
+
+
+def heated_again(was_c: Sequence[float], now_c: Sequence[float]) -> list[str]:
+    """Lines that heat each head that was on and is off."""
+    off = [
+        k
+        for k, (was, now) in enumerate(zip_longest(was_c, now_c, fillvalue=0.0))
+        if was and not now
+    ]
+    alone = max(len(was_c), len(now_c)) < 2
+    words = [f"S{was_c[k]:g}" if alone else f"T{k} S{was_c[k]:g}" for k in off]
+    heats = [] if alone else [f"M104 {word}" for word in words]
+    return [*heats, *(f"M109 {word}" for word in words)]
 
 
 def number_of(checked: PrintableProgram) -> int:

@@ -1,7 +1,8 @@
 """The supervisor's own program: standard library only, so that it starts in milliseconds.
 
 Run by `safety.Supervisor` with the numbers of two inherited descriptors: the pipe whose end tells
-of the sender's death, and the open port. It imports nothing of ours.
+of the sender's death, and the open port; the journal's path; and a line for each of several heads
+that switches it off. It imports nothing of ours.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ import select
 import sqlite3
 import sys
 import time
+from collections.abc import Sequence
 
 HEATERS_OFF = (b"M104 S0", b"M140 S0")
 END_WAIT = b"M108"
@@ -22,7 +24,7 @@ LIFT = (
     b"G90",
 )
 QUESTIONS = 3
-_TARGET = re.compile(rb"\b([TB])\d?: ?-?[\d.]+ ?/ ?(-?[\d.]+)")
+_TARGET = re.compile(rb"\b(T\d{0,2}|B): ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 _KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
 _NOT_MOVED = re.compile(rb"^(?:!!|Error:)", re.MULTILINE)
 _KLIPPER_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
@@ -39,30 +41,31 @@ def main() -> None:
     pipe_fd, port_fd, journal = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
     if os.read(pipe_fd, 1):
         return
-    outcome = f"supervisor: sender died; {make_safe(port_fd)}"
+    outcome = f"supervisor: sender died; {make_safe(port_fd, heads_off=sys.argv[4:])}"
     if journal:
         with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(journal)) as db:
             db.execute("INSERT INTO note SELECT MAX(id), ?, ? FROM job", (time.time(), outcome))
             db.commit()
 
 
-def make_safe(port_fd: int, *, lift: bool = True) -> str:
+def make_safe(port_fd: int, *, lift: bool = True, heads_off: Sequence[str] = ()) -> str:
     """Send the commands, each answered or given up on; return what became of them.
 
     Heaters first; then, with `lift`, the nozzle away from the part; heaters again, because a line
-    may have been lost.
+    may have been lost. `heads_off` are the lines for heads that are not chosen.
     """
     answered, refusal = 0, ""
     os.set_blocking(port_fd, False)  # the sender may have died while it waited in a read
     write(port_fd, b"\n")  # ends the half line that a killed sender may have left
     wait(port_fd, 0.05)
-    commands = (END_WAIT, *HEATERS_OFF, b"M107", *(LIFT if lift else ()), *HEATERS_OFF)
+    off = (*HEATERS_OFF, *(line.encode() for line in heads_off))
+    commands = (END_WAIT, *off, b"M107", *(LIFT if lift else ()), *off)
     for said, command in enumerate(commands):
         if not write(port_fd, command + b"\n"):
             return "THE PORT IS GONE, HEATERS COULD NOT BE REACHED"
         ok, heard = wait(port_fd, PORT_ANSWERS_S if answered or said < 2 else SILENT_S)
         answered += ok
-        if command in HEATERS_OFF and (refused := _KLIPPER_REFUSES.search(heard)):
+        if command in off and (refused := _KLIPPER_REFUSES.search(heard)):
             refusal = refused.group(1).decode("ascii", "replace")
         if command in LIFT and _NOT_MOVED.search(heard):
             lift = False
@@ -93,11 +96,22 @@ def confirmed_off(port_fd: int) -> bool:
             return False
         heard = wait(port_fd, PORT_ANSWERS_S)[1]
         targets = dict(_TARGET.findall(heard))
-        if b"T" in targets:
-            return all(float(value) == 0.0 for value in targets.values())
+        if any(name.startswith(b"T") for name in targets):
+            on = [name for name, value in targets.items() if float(value) != 0.0]
+            if not on or not send_off(port_fd, on):
+                return not on
         if starts := _KLIPPER_STARTS.search(heard) is not None:
             time.sleep(PORT_ANSWERS_S)
     return False
+
+
+def send_off(port_fd: int, on: list[bytes]) -> bool:
+    """Switch off heads that nobody had told of; whether there is one among what is on."""
+    heads = [name for name in on if name[1:]]
+    for name in heads:
+        write(port_fd, b"M104 %s S0\n" % name)
+        wait(port_fd, PORT_ANSWERS_S)
+    return bool(heads)
 
 
 def write(port_fd: int, data: bytes) -> bool:

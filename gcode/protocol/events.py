@@ -115,9 +115,26 @@ class HeaterReading:
 
 @dataclass(frozen=True, slots=True)
 class TemperatureReport:
-    """Temperatures by heater name as the firmware gives it: `T`, `T0`, `B`, `C`, …"""
+    """Temperatures by heater name as the firmware gives it: `T`, `T0`, `B`, `C`, …
+
+    `T` is the head that is chosen, `T0`, `T1`, … are all of several; Klipper tells those alone.
+    """
 
     heaters: dict[str, HeaterReading]
+
+    @property
+    def heads(self) -> dict[int, HeaterReading]:
+        """By number, of several; empty where the printer tells of one alone."""
+        numbered = ((name[1:], heater) for name, heater in self.heaters.items() if name[0] == "T")
+        return {int(number): heater for number, heater in numbered if number}
+
+    @property
+    def hotend(self) -> HeaterReading | None:
+        """That of the head that is chosen, or else of the one that is told to be hottest."""
+        each = self.heads.values()
+        return self.heaters.get("T") or max(
+            each, key=lambda heater: heater.target_c or 0.0, default=None
+        )
 
 
 @dataclass(frozen=True, slots=True)

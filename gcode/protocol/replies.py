@@ -37,9 +37,9 @@ _RESEND = re.compile(r"(?:resend|rs)\s*[: ]\s*N?(\d{1,9})\s*", re.IGNORECASE)
 _OK_REPLY = re.compile(r"ok(?:\s+(.*))?", re.DOTALL)
 _ADVANCED = re.compile(r"(?:N(\d{1,9})\s*)?(?:P\d{1,4}\s+)?(?:B\d{1,4})?\s*")
 _BUSY_REPLY = re.compile(r"(?:echo:\s*)?busy:\s*(.+)", re.IGNORECASE)
-_HEATER = re.compile(rf"\b([TBCPA]\d?):\s?({_REPLIED_NUMBER})(?:\s*/\s*({_REPLIED_NUMBER}))?")
+_HEATER = re.compile(rf"\b([TBCPA]\d{{0,2}}):\s?({_REPLIED_NUMBER})(?:\s*/\s*({_REPLIED_NUMBER}))?")
 _TEMPERATURES = re.compile(
-    rf"[TBCPA]\d?:\s?{_REPLIED_NUMBER}(?:\s*/\s*{_REPLIED_NUMBER})?(?:\s.*)?"
+    rf"[TBCPA]\d{{0,2}}:\s?{_REPLIED_NUMBER}(?:\s*/\s*{_REPLIED_NUMBER})?(?:\s.*)?"
 )
 _POSITION = re.compile(
     rf"X:\s?({_REPLIED_NUMBER})\s+Y:\s?({_REPLIED_NUMBER})\s+Z:\s?({_REPLIED_NUMBER})\s+E:\s?({_REPLIED_NUMBER})\b.*"

@@ -39,8 +39,8 @@ class Wire:
     def send(self, line: str, tag: str) -> None:
         self.queue.append((line, tag))
 
-    def heat(self) -> tuple[float, float]:
-        return self.targets[0], self.targets[1]
+    def heat(self) -> tuple[tuple[float, ...], float]:
+        return tuple(self.targets[:-1]), self.targets[-1]
 
     def cancel(self) -> None:
         self.cancelled = True
@@ -148,7 +148,7 @@ def test_a_touch_is_cold_and_what_the_firmware_says_against_it_is_ours() -> None
     """OctoPrint would cancel the print for "Failed to reach target"."""
     wire = Wire().begin()
     wire.targets = [0.0, 60.0]  # cooled for the touches
-    wire.held.off(hotend=210.0)  # somebody ended the agent
+    wire.held.off(hotends=[210.0])  # somebody ended the agent
     wire.settle()
     assert not wire.held.wrong("Thermal Runaway"), "no touch is under way"
     wire.held.program(number=7, send="a", lines=TOUCH, touches=True)

@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import Any, Protocol, runtime_checkable
 
 AHEAD_LINES = 8
@@ -46,8 +47,8 @@ class Server(Protocol):
     def send(self, line: str, tag: str) -> None:
         """Have a line sent in its turn; `tag` comes back once it is on the wire."""
 
-    def heat(self) -> tuple[float, float]:
-        """What hotend and bed are set to, °C."""
+    def heat(self) -> tuple[tuple[float, ...], float]:
+        """What the hotend of each head, and the bed, are set to, °C."""
 
     def cancel(self) -> None:
         """Cancel the print."""
@@ -117,6 +118,20 @@ class Shown:
     prompt: dict[str, Any] | None = None
 
 
+def _either_c(first: Sequence[float], other: Sequence[float]) -> tuple[float, ...]:
+    """By head, what one tells of it, or else the other."""
+    return tuple(a or b for a, b in zip_longest(first, other, fillvalue=0.0))
+
+
+def _heated_again(was_c: Sequence[float], now_c: Sequence[float]) -> tuple[str, ...]:
+    """Lines that heat each head that was on and is off."""
+    pairs = enumerate(zip_longest(was_c, now_c, fillvalue=0.0))
+    off = [k for k, (was, now) in pairs if was and not now]
+    if max(len(was_c), len(now_c)) < 2:
+        return tuple(f"M109 S{was_c[k]:g}" for k in off)
+    return tuple(f"{heat} T{k} S{was_c[k]:g}" for heat in ("M104", "M109") for k in off)
+
+
 class Held:
     """The plugin's state.
 
@@ -146,7 +161,7 @@ class Held:
         self._program: Program | None = None
         self._paused = False
         self._way_back: tuple[str, ...] = ()
-        self._heat = (0.0, 0.0)
+        self._heat: tuple[tuple[float, ...], float] = ((), 0.0)
         self._agent, self._seen_s, self.page = "", float("-inf"), ""
         self._active_s = clock()
         self._shown = Shown()
@@ -170,7 +185,7 @@ class Held:
                     "number": program.number, "done": program.done, "over": program.over,
                     "total": len(program.lines), "paused": self._paused, "wrong": program.wrong,
                 },
-                "heat": {"hotend": self._heat[0], "bed": self._heat[1]},
+                "heat": {"hotends": list(self._heat[0]), "bed": self._heat[1]},
                 "doing": self._shown.doing,
                 "said": list(self._shown.said),
                 "prompt": self._shown.prompt,
@@ -210,7 +225,7 @@ class Held:
         with self._lock:
             self._print = Print(path, uuid.uuid4().hex[:8])
             self._let_go()
-            self._heat = (0.0, 0.0)
+            self._heat = ((), 0.0)
         self._push()
 
     def ended(self, how: str) -> None:
@@ -236,9 +251,14 @@ class Held:
         self._say_safe("OctoPrint was restarted while a print rested at its look: it is over")
 
     def _say_safe(self, why: str) -> None:
-        for line in SAFE_COMMANDS:
+        for line in (*SAFE_COMMANDS, *self._heads_off()):
             self._send(line)
         self.say(f"{why}; heaters are switched off.", wrong=True)
+
+    def _heads_off(self) -> tuple[str, ...]:
+        """Of several heads the word for the hotend means the one that is chosen."""
+        count = len(self._server.heat()[0])
+        return tuple(f"M104 T{k} S0" for k in range(count) if count > 1)
 
     def _send(self, line: str, tag: str = "") -> None:
         self._later(lambda: self._server.send(line, tag))
@@ -359,12 +379,11 @@ class Held:
     def _heating(self, *, hotend: bool = True) -> tuple[str, ...]:
         """What heats again what was switched off here; a hotend that is not is kept in mind."""
         with self._lock:
-            hotend_c, bed_c = self._heat
-            self._heat = (0.0 if hotend else hotend_c, 0.0)
-        hotend_c = hotend_c if hotend else 0.0
+            was_c, bed_c = self._heat
+            self._heat = (() if hotend else was_c, 0.0)
         now = self._server.heat()
         bed = (f"M190 S{bed_c:g}",) if bed_c and not now[1] else ()
-        return (*bed, *((f"M109 S{hotend_c:g}",) if hotend_c and not now[0] else ()))
+        return (*bed, *(_heated_again(was_c, now[0]) if hotend else ()))
 
     def _feed(self) -> None:
         """Hand some lines to OctoPrint; in `later`'s thread, so in order."""
@@ -421,24 +440,24 @@ class Held:
         self._later(self._feed)
         self._push()
 
-    def off(self, *, hotend: float = 0.0, bed: float = 0.0) -> None:
+    def off(self, *, hotends: Sequence[float] = (), bed: float = 0.0) -> None:
         """Switch heaters off; what they were set to is kept for whoever goes on.
 
         Parameters
         ----------
-        hotend, bed
+        hotends, bed
             What they were set to as the job came to rest, °C, where they are off now.
         """
         with self._lock:
-            self._heat = (self._heat[0] or hotend, self._heat[1] or bed)
+            self._heat = (_either_c(self._heat[0], hotends), self._heat[1] or bed)
         self._switch_off(bed=True)
 
     def _switch_off(self, *, bed: bool) -> None:
-        hotend_c, bed_c = self._server.heat()
+        hotends_c, bed_c = self._server.heat()
         with self._lock:
             was = self._heat
-            self._heat = (hotend_c or was[0], (bed_c if bed else 0.0) or was[1])
-        for line in SAFE_COMMANDS if bed else SAFE_COMMANDS[:1]:
+            self._heat = (_either_c(hotends_c, was[0]), (bed_c if bed else 0.0) or was[1])
+        for line in (*(SAFE_COMMANDS if bed else SAFE_COMMANDS[:1]), *self._heads_off()):
             self._send(line)
         self._push()
 
@@ -557,8 +576,8 @@ class Held:
             there = self._agent_there()
         if not waits or not late:
             return
-        hotend_c, bed_c = self._server.heat()
-        if hotend_c or (bed_c and not there):
+        hotends_c, bed_c = self._server.heat()
+        if any(hotends_c) or (bed_c and not there):
             self._switch_off(bed=not there)
             what = "the nozzle is" if there else "heaters are"
             self.say(f"nothing was done at this look for {self._patience_s():g} s: {what} "

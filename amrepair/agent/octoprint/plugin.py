@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import queue
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -72,11 +73,13 @@ class AmrepairPlugin(
         """Have a line sent in its turn."""
         self._printer.commands([line], tags={f"{TAG}{tag}"} if tag else set())
 
-    def heat(self) -> tuple[float, float]:
-        """What hotend and bed are set to, °C."""
+    def heat(self) -> tuple[tuple[float, ...], float]:
+        """What the hotend of each head, and the bed, are set to, °C."""
         found = self._printer.get_current_temperatures()
-        hotend, bed = (found.get(name, {}).get("target") or 0.0 for name in ("tool0", "bed"))
-        return float(hotend), float(bed)
+        tools = sorted(int(name[4:]) for name in found if re.fullmatch(r"tool\d+", name))
+        names = [f"tool{k}" for k in tools] or ["tool0"]
+        *hotends, bed = (found.get(name, {}).get("target") or 0.0 for name in (*names, "bed"))
+        return tuple(float(c) for c in hotends), float(bed)
 
     def cancel(self) -> None:
         """Cancel the print."""
