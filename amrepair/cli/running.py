@@ -54,6 +54,7 @@ from gcode.hosts.journal import Journal, default_path
 from gcode.hosts.port import Printer
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 from gcode.reader import job_for
+from gcode.resumption.settings import require_one_frame
 
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 PROFILES = "profiles"  # in the run's folder: those of the job's own settings
@@ -207,6 +208,7 @@ def new_run(
             "or name another folder with --out"
         )
     job = job_for(text, setup.printer)
+    require_one_frame(job)
     refuse_own_hits(job, setup)
     fixed = layers_every(job, looks.every)
     pace = (looks.every or ADAPTIVE_LAYERS) if looks.adaptive else 0

@@ -1,5 +1,7 @@
 """Which of several filaments a job holds at a line, and which of them laid what is missing there.
 
+They go to one nozzle, or each of several heads has its own; what nozzle it is of counts as well.
+
 Their materials are those that the slicer wrote into the job; nothing is measured here.
 """
 
@@ -47,7 +49,14 @@ def other_material(plan: RepairPlan, job: Job, line: int) -> str:
 
 @functools.lru_cache(maxsize=1)
 def materials_of(text: str) -> tuple[str, ...]:
-    """The material of each of a job's filaments, in their slicer's words; empty where untold."""
+    """The material of each of a job's filaments, in their slicer's words; empty where untold.
+
+    Where they go to nozzles of several widths these are told, too: none lays another's bead.
+    """
     settings = read_settings("job", text)
-    told = "" if settings is None else settings[1].values.get("filament_type", "")
-    return tuple(name.strip().strip('"') for name in told.split(";")) if told else ()
+    values = {} if settings is None else settings[1].values
+    told, nozzles = values.get("filament_type", ""), values.get("nozzle_diameter", "").split(",")
+    names = tuple(name.strip().strip('"') for name in told.split(";")) if told else ()
+    if len(set(nozzles)) < 2 or len(nozzles) != len(names):
+        return names
+    return tuple(f"{name} by {mm.strip()} mm" for name, mm in zip(names, nozzles, strict=True))

@@ -37,6 +37,7 @@ from amrepair.template import CutTemplate, KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
 from gcode.check import JobBridges
 from gcode.profiles import PrintSetup
+from gcode.profiles.own_settings import setup_for_head
 from gcode.reader import Beads, Job, Turn
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
@@ -132,7 +133,8 @@ def _expected(
             return part.finished_site()
         return part.site_at(stop, by_beads=by_beads)
 
-    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_otherwise)
+    here = _with_its_head(job, at)
+    return Expected(template, build_from_template, setup, by_beads, detector, here, ends_otherwise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +237,16 @@ class _Part:
             finished=self.finished,
             laid=_laid(self.own, done, self.kept),
         )
+
+
+def _with_its_head(job: Job, at: Callable[[Stop], Site]) -> Callable[[Stop], Site]:
+    """A repair is laid by the head, or the filament, that is there: as its material asks."""
+
+    def found(stop: Stop) -> Site:
+        site, tool = at(stop), int(job.tools[stop.line])
+        return replace(site, setup=setup_for_head(site.setup, job.program.text, tool))
+
+    return found
 
 
 def _highest_mm(start: Points, end: Points, pick: Mask) -> float | None:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from gcode.dialects import dialect_of
 from gcode.errors import ProfileError
@@ -215,7 +216,27 @@ def printer_of_words(text: str) -> str:
     return DEFAULT_PRINTER if spoken is None else f"generic_{spoken}"
 
 
-def own_settings(text: str, name: str) -> OwnSettings | SlicedFor | None:
+@lru_cache(maxsize=16)
+def setup_for_head(setup: PrintSetup, text: str, head: int) -> PrintSetup:
+    """A job's setup with the material of one of several heads, or filaments.
+
+    As it is where the job tells of one alone, or another material than its own was chosen.
+    """
+    own = own_settings(text, "job") if setup.printer.heads > 1 else None
+    if not isinstance(own, OwnSettings) or _said(own.setup()) != _said(setup):
+        return setup
+    of_head = own_settings(text, "job", head)
+    if not isinstance(of_head, OwnSettings):
+        return setup
+    return replace(setup, material=of_head.setup().material)
+
+
+def _said(setup: PrintSetup) -> dict[str, Any]:
+    """A material, whatever it is called."""
+    return setup.material.model_dump(exclude={"id", "name", "sha256"})
+
+
+def own_settings(text: str, name: str, head: int | None = None) -> OwnSettings | SlicedFor | None:
     """What a job's slicer wrote into it; None where there is nothing.
 
     Parameters
@@ -224,6 +245,8 @@ def own_settings(text: str, name: str) -> OwnSettings | SlicedFor | None:
         The whole job.
     name
         What it is called in messages.
+    head
+        Whose settings are taken of several heads; of the one that prints most where left out.
 
     Raises
     ------
@@ -233,7 +256,7 @@ def own_settings(text: str, name: str) -> OwnSettings | SlicedFor | None:
     ours = _sliced_for(text, name)
     if ours is not None:
         return ours
-    found = import_job(name, text)
+    found = import_job(name, text, head=head)
     if found is None:
         return None
     made = found.profiles[0]

@@ -144,7 +144,9 @@ def import_profiles(
     return ImportedFile(str(path), made, left, tuple(notes))
 
 
-def import_job(name: str, text: str, *, inherits: str | None = None) -> ImportedFile | None:
+def import_job(
+    name: str, text: str, *, inherits: str | None = None, head: int | None = None
+) -> ImportedFile | None:
     """The settings that a slicer wrote into a job, as profiles; None where it wrote none.
 
     A setting that our profiles do not allow is left, with the reason, and inherited: whoever has
@@ -155,6 +157,9 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     inherits
         The printer profile to take from what the job does not know; that of its model where left
         out, or a generic one.
+    head
+        Whose settings are taken of several heads, or filaments; of those with which the most is
+        printed where left out.
 
     Raises
     ------
@@ -165,7 +170,7 @@ def import_job(name: str, text: str, *, inherits: str | None = None) -> Imported
     if settings is None:
         return None
     rules, source = settings
-    head = head_used(text)
+    head = head_used(text) if head is None else head
     of_filament = {key for key, rule in rules.items() if rule.kind == "materials"}
     of_filament |= {key for key, kind in source.name_keys.items() if kind == "materials"}
     values = of_head(source.values, head, of_filament | {"filament_type"})
