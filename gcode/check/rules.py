@@ -33,7 +33,7 @@ from gcode.profiles.own_settings import SAME_NOZZLE_MM
 from gcode.reader.text_kernels import INCH_MM
 
 HEATER_COMMANDS = {
-    **dict.fromkeys(("M104", "M109"), "hotend"),
+    **dict.fromkeys(("M104", "M104.1", "M109"), "hotend"),
     **dict.fromkeys(("M140", "M190"), "bed"),
     **dict.fromkeys(("M141", "M191"), "chamber"),
 }

@@ -35,10 +35,11 @@ _MARLINS = (
 # currents, a fan of the housing; and end stops in software on.
 _MARLINS_HEIRS = "G161 G162 M6 M7 M108 M132 M907 M651 M652 M211"
 # Checks of printer, nozzle and firmware; the mass of the part, the area that is probed, pressure
-# advance; a stuck filament; a multi-material unit's own commands.
+# advance; a stuck filament; a multi-material unit's own commands; what another head is to be at
+# soon.
 _PRUSAS = (
     "M862.1 M862.2 M862.3 M862.4 M862.5 M862.6 M74 M555 M569 M572 M591 M593 "
-    "M403 M701 M702 M708 TX TC T?"
+    "M403 M701 M702 M708 TX TC T? M104.1"
 )
 
 KNOWN_COMMANDS: dict[str, frozenset[str]] = {

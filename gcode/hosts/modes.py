@@ -201,7 +201,7 @@ def _hotend(modes: Modes, told: float | None, target_c: float) -> Modes:
 def _heat(modes: Modes, name: str, words: dict[str, float]) -> Modes:
     """Heaters and the part's fan (further ones have a P)."""
     value = words.get("S", words.get("R"))
-    if name in ("M104", "M109") and value is not None:
+    if name in ("M104", "M104.1", "M109") and value is not None:
         return _hotend(modes, words.get("T"), value)
     if name in ("G10", "M568") and "S" in words and "P" in words:  # RepRapFirmware's
         return _hotend(modes, words["P"], max(words["S"], 0.0))

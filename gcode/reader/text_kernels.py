@@ -169,7 +169,7 @@ def run(kinds, codes, words, both_modes, g91_moves_e, tool_zeroes_e, offset, sta
                 now[S_ABS_E] = 1.0
             elif code == 830:
                 now[S_ABS_E] = 0.0
-            elif code in (1040, 1090):
+            elif code in (1040, 1041, 1090):  # M104.1: soon, as slicers tell Prusa's XL
                 heater = heater_of(now, w[T])
                 if heater >= 0 and not np.isnan(w[S]):
                     now[heater] = max(w[S], 0.0)

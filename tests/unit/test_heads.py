@@ -117,7 +117,10 @@ def heater_targets(text: str, dialect: str = "marlin", heads: int = 2) -> list[f
 
 
 WORDS = {
-    "marlin": ("M104 S{c}", "M109 S{c}", "M104 T{k} S{c}", "M109 T{k} S{c}", "T{k}"),
+    "marlin": (
+        "M104 S{c}", "M109 S{c}", "M104 T{k} S{c}", "M109 T{k} S{c}", "T{k}",
+        "M104.1 T{k} P30 Q32 S{c}",
+    ),
     "klipper": (
         "M104 S{c}", "M104 T{k} S{c}", "T{k}", "SET_HEATER_TEMPERATURE HEATER={n} TARGET={c}",
         "ACTIVATE_EXTRUDER EXTRUDER={n}", "SET_HEATER_TEMPERATURE HEATER={n}", "TURN_OFF_HEATERS",
