@@ -85,16 +85,15 @@ def test_a_tower_is_nothing_to_be_mended() -> None:
 
 
 def supported() -> Job:
-    """The block's job up to layer 10, then a layer of a support of its own height beside it."""
+    """The block's job, beside it strands of a support that end 0.09 mm above its layer 10."""
     job = job_of(BLOCK)
-    last = np.flatnonzero(job.beads.layer == 10)
-    moved = last[::3]
+    moved = np.flatnonzero(job.beads.layer == 9)[::3]
     roles = (*job.beads.roles, "Support material")
     role = job.beads.role.copy()
     role[moved] = len(roles) - 1
     start, end = job.beads.start_mm.copy(), job.beads.end_mm.copy()
     for place in (start, end):
-        place[moved] += [22.0, 0.0, 0.09]
+        place[moved] += [22.0, 0.0, 0.29]
     return replace(
         job, beads=replace(job.beads, role=role, roles=roles, start_mm=start, end_mm=end)
     )
@@ -121,4 +120,4 @@ def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
     middle = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support] - [0.0, 0.0, 0.1]
     of_part = np.array([[100.0, 89.8, 1.5]])
     assert (beyond(middle, np.full(len(middle), 0.3)) >= 0.4).all()
-    assert (beyond(of_part, np.array([0.3])) < 0.2).all()
+    assert (beyond(of_part, np.array([0.3])) < 0.3).all()
