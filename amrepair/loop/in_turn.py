@@ -14,7 +14,7 @@ import trimesh
 from jaxtyping import Float
 from scipy import ndimage
 
-from amrepair.arrays import Box, Mask, Numbers
+from amrepair.arrays import Box, Numbers
 from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import Transform
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
@@ -40,7 +40,7 @@ def finished_at(job: Job, turn: Turn, setup: PrintSetup) -> Finished | None:
     parts = ~of_roles(beads, BESIDE_THE_PART) & (beads.layer >= 0)
     theirs, own = (
         standing_field(beads.subset(parts & pick), job.program.text.count("\n"), machine).z_mm > 0
-        for pick in (beads.layer < turn.first_layer, laid_in(job, turn))
+        for pick in (beads.layer < turn.first_layer, job.laid_in(turn))
     )
     if (theirs & own).sum() > LEAST_SHARE * own.sum():
         raise InputError(
@@ -50,12 +50,6 @@ def finished_at(job: Job, turn: Turn, setup: PrintSetup) -> Finished | None:
         )
     away_mm, off_own_mm = (ndimage.distance_transform_edt(~what) for what in (theirs, own))
     return Finished(standing, np.asarray(away_mm < off_own_mm))
-
-
-def laid_in(job: Job, turn: Turn) -> Mask:
-    """Which of a job's beads one turn lays."""
-    layer = job.beads.layer
-    return np.asarray((layer >= turn.first_layer) & (layer < turn.end_layer))
 
 
 def refuse_own_hits(job: Job, setup: PrintSetup) -> None:
@@ -115,7 +109,7 @@ def template_of(
     if len(job.turns) == 1:
         return template
     beads = job.beads
-    x0, y0, x1, y1 = box_of_beads_mm(job, laid_in(job, turn) & ~of_roles(beads, BESIDE_THE_PART))
+    x0, y0, x1, y1 = box_of_beads_mm(job, job.laid_in(turn) & ~of_roles(beads, BESIDE_THE_PART))
     laid = np.array([[x0, y0], [x1, y1]])
     if isinstance(template, StoodTemplate):
         own = [k for k, box in enumerate(template.boxes_mm) if _shares(box, laid)]

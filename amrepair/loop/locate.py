@@ -393,8 +393,7 @@ def tops_of(job: Job) -> list[float]:
 
 def _begins_mm(job: Job, layer: int) -> float:
     """Where the part begins of which a layer is one."""
-    own = next(turn for turn in job.turns if layer < turn.end_layer)
-    return foot_mm(job.of_turn(own))
+    return foot_mm(job.of_turn(job.turn_of(layer)))
 
 
 def foot_mm(job: Job) -> float:

@@ -96,7 +96,7 @@ class Stops:
             return  # a fixed stop on the way: nothing new
         self._gap = self._pace.next_gap(self._gap, trouble=trouble)
         self._due = stop.layer_index + self._gap
-        turn = next(one for one in self._turns if stop.layer_index < one.end_layer)
+        turn = self._job.turn_of(stop.layer_index)
         if self._due >= turn.end_layer - 1:
             self._begin(turn.index + 1)
 

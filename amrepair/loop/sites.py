@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from amrepair.arrays import Mask, Points
 from amrepair.frames import Transform
-from amrepair.loop.in_turn import finished_at, laid_in, refuse_own_hits, template_of
+from amrepair.loop.in_turn import finished_at, refuse_own_hits, template_of
 from amrepair.loop.locate import (
     BESIDE_THE_PART,
     MOVED_MM,
@@ -182,7 +182,7 @@ class _Part:
         """What is laid beside the part before a line, but for what of its own is judged."""
         beads = self.job.beads
         which = (beads.line < line) & (beads.layer >= 0)
-        which[laid_in(self.job, self.turn)] &= ~judged
+        which[self.job.laid_in(self.turn)] &= ~judged
         return _beside(self.job, which)
 
     def finished_site(self) -> Site:

@@ -25,7 +25,6 @@ from scipy.spatial import cKDTree
 
 from amrepair.arrays import ColumnMask, HeightMap, Mask, PlanePoints, Values
 from amrepair.errors import ScannerError
-from amrepair.loop.in_turn import laid_in
 from amrepair.loop.locate import BESIDE_THE_PART, of_roles
 from amrepair.loop.looks import Stop
 from gcode.profiles import PrintSetup
@@ -142,7 +141,7 @@ def flats_of(
     """
     beads, probe = job.beads, setup.printer.feeler
     pick = (beads.line < stop.line) & (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
-    pick &= laid_in(job, job.turn_at(stop.line))
+    pick &= job.laid_in(job.turn_at(stop.line))
     if stop.layer_index is not None:
         pick &= beads.layer == stop.layer_index
     if not pick.any():

@@ -13,11 +13,11 @@ from amrepair.loop.travel import PARK_LIFT_MM
 from amrepair.postprocess.places import Place
 from gcode.dialects import number
 from gcode.reader import Job
+from gcode.reader.text_kernels import INCH_MM
 from gcode.resumption.head import feed
 
 LIFT_MM_S = 10.0
 _Z_SHIFT = re.compile(r"^\s*G92\b[^;\n]*Z.*$", re.IGNORECASE | re.MULTILINE)
-MM_PER_INCH = 25.4
 
 
 def over_finished(job: Job, place: Place, words: tuple[str, ...]) -> tuple[str, ...]:
@@ -42,7 +42,7 @@ def over_finished(job: Job, place: Place, words: tuple[str, ...]) -> tuple[str, 
             f"the job prints its objects one after the other and says {shift.group(0).strip()!r}: "
             "nobody knows how high a pause has to be lifted over what is finished"
         )
-    unit_mm = 1.0 if state.units_mm else MM_PER_INCH
+    unit_mm = 1.0 if state.units_mm else INCH_MM
     up, down = (high_mm, z_mm) if state.absolute_xyz else (high_mm - z_mm, z_mm - high_mm)
     speed = f" F{feed(LIFT_MM_S / unit_mm)}"
     again = [f"G1 F{feed(state.feed_mm_s / unit_mm)}"] if state.feed_mm_s > 0 else []

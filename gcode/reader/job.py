@@ -147,14 +147,22 @@ class Job:
         begun = bisect_right([turn.first_line for turn in turns], line - 1)
         return turns[max(begun - 1, 0)]
 
+    def turn_of(self, layer: int) -> Turn:
+        """The turn that a layer belongs to."""
+        return next(turn for turn in self.turns if layer < turn.end_layer)
+
     def end_of(self, turn: Turn) -> int:
         """The line after the last bead of a turn."""
         return int(self.beads.line[np.searchsorted(self.beads.layer, turn.end_layer) - 1]) + 1
 
+    def laid_in(self, turn: Turn) -> Bool[np.ndarray, " n"]:
+        """(n,) which beads one turn lays."""
+        layer = self.beads.layer
+        return (layer >= turn.first_layer) & (layer < turn.end_layer)
+
     def of_turn(self, turn: Turn) -> Job:
         """The same, as if nothing but what one turn lays were laid; its layers keep their index."""
-        layer = self.beads.layer
-        own = (layer >= turn.first_layer) & (layer < turn.end_layer)
+        own = self.laid_in(turn)
         return self if own.all() else replace(self, beads=self.beads.subset(own))
 
     @property

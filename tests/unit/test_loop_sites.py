@@ -65,38 +65,37 @@ def test_a_part_that_is_closed_is_held_against_its_template() -> None:
     assert sites(job_of(BLOCK - HOLLOW), template, here, SETUP)(stop).planned is not None
 
 
+def moved_aside(job: Job, which: np.ndarray, name: str, by_mm: tuple[float, float, float]) -> Job:
+    """The same job, some of whose beads have a role of their own, elsewhere."""
+    roles = (*job.beads.roles, name)
+    role = job.beads.role.copy()
+    role[which] = len(roles) - 1
+    start, end = job.beads.start_mm.copy(), job.beads.end_mm.copy()
+    for place in (start, end):
+        place[which] += by_mm
+    return replace(
+        job, beads=replace(job.beads, role=role, roles=roles, start_mm=start, end_mm=end)
+    )
+
+
 def test_a_tower_is_nothing_to_be_mended() -> None:
     """regression: what a change of filament pushes out was planned to be repaired there."""
     job = job_of(BLOCK)
     tower = np.flatnonzero(job.beads.layer >= 0)[::7]
-    roles = (*job.beads.roles, "Wipe tower")
-    role = job.beads.role.copy()
-    role[tower] = len(roles) - 1
-    start, end = job.beads.start_mm.copy(), job.beads.end_mm.copy()
-    for place in (start, end):
-        place[tower] += [60.0, 0.0, 0.0]
-    beads = replace(job.beads, role=role, roles=roles, start_mm=start, end_mm=end)
+    beside = moved_aside(job, tower, "Wipe tower", (60.0, 0.0, 0.0))
     template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
-    site = sites(replace(job, beads=beads), template, here, SETUP)(plan_stops(job, [10])[0])
+    site = sites(beside, template, here, SETUP)(plan_stops(job, [10])[0])
     assert site.planned is not None
     assert site.beside is not None
-    assert site.planned.bounds_mm[1, 0] < 130.0 < start[tower, 0].min()
+    assert site.planned.bounds_mm[1, 0] < 130.0 < beside.beads.start_mm[tower, 0].min()
     assert site.beside.box_mm[0] > 130.0
 
 
 def supported() -> Job:
     """The block's job, beside it strands of a support that end 0.09 mm above its layer 10."""
     job = job_of(BLOCK)
-    moved = np.flatnonzero(job.beads.layer == 9)[::3]
-    roles = (*job.beads.roles, "Support material")
-    role = job.beads.role.copy()
-    role[moved] = len(roles) - 1
-    start, end = job.beads.start_mm.copy(), job.beads.end_mm.copy()
-    for place in (start, end):
-        place[moved] += [22.0, 0.0, 0.29]
-    return replace(
-        job, beads=replace(job.beads, role=role, roles=roles, start_mm=start, end_mm=end)
-    )
+    strands = np.flatnonzero(job.beads.layer == 9)[::3]
+    return moved_aside(job, strands, "Support material", (22.0, 0.0, 0.29))
 
 
 def test_a_part_is_as_high_as_its_own_layer_and_not_as_its_support_s() -> None:

@@ -10,6 +10,7 @@ import manifold3d as m3
 import numpy as np
 import trimesh
 from loop_bench import solid_mesh
+from objects_job import Block
 
 from amrepair.frames import Transform
 from amrepair.loop.locate import stood
@@ -29,16 +30,8 @@ SETUP = load_setup("prusa_mk3s", "pla", "repair_0.20")
 
 
 @dataclass(frozen=True)
-class Tower:
-    """A block: its corner on the bed, and its size, mm."""
-
-    x_mm: float
-    y_mm: float
-    size_mm: tuple[float, float, float]
-
-    @property
-    def solid(self) -> m3.Manifold:
-        return m3.Manifold.cube(self.size_mm).translate((self.x_mm, self.y_mm, 0.0))
+class Tower(Block):
+    """A block whose corner lies on the bed."""
 
     @property
     def box_mm(self) -> tuple[float, float, float, float]:
