@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import shutil
@@ -35,6 +36,22 @@ hypothesis.settings.load_profile("suite")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--regenerate-golden", action="store_true", help="write golden files anew")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Load a share of the tests before all are collected.
+
+    pytest rewrites the asserts of a module where no worker has done so and kept it. Workers that
+    collect in one order rewrite the same module at the same time, each for itself.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker is None or session.config.args != session.config.getini("testpaths"):
+        return
+    here, count = Path(__file__).parent, int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    for path in sorted(here.rglob("test_*.py"))[int(worker.removeprefix("gw")) :: count]:
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # told when collected
+            importlib.import_module(".".join(path.relative_to(here.parent).with_suffix("").parts))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -13,7 +13,6 @@ from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import parse_faults
 from gcode.firmware.serve import FRAME, PtyServer
 from gcode.profiles import PrinterProfile
-from gcode.surfaces import HeightField
 
 
 def _recorder(path: str) -> Callable[[bytes], None]:
@@ -43,6 +42,8 @@ def main() -> None:
         core.enable_advanced_ok()
     core.machine.dead_probe = options["dead_probe"]
     if options["standing"]:
+        from gcode.surfaces import HeightField
+
         surface = HeightField.read(Path(options["standing"]))
         core.machine.stand(surface, seed=options["seed"])
         assert core.machine.contact is not None

@@ -10,17 +10,20 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from gcode.firmware.contact import ProbeContact
 from gcode.firmware.heads import Heads
-from gcode.firmware.laid import Laid
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.planner import Planner
 from gcode.firmware.thermal import BED_HEATER, Heater
 from gcode.firmware.variants import Variant
 from gcode.profiles import PrinterProfile
-from gcode.surfaces import HeightField
 from gcode.units import mm_s_from_mm_min
+
+if TYPE_CHECKING:  # what stands on the bed is felt by few printers, and loads the kernels
+    from gcode.firmware.contact import ProbeContact
+    from gcode.firmware.laid import Laid
+    from gcode.surfaces import HeightField
 
 ARC_SEGMENT_MM = 0.5
 """Chord of an arc (Marlin's MIN_ARC_SEGMENT_MM … MAX_ARC_SEGMENT_MM lie around it)."""
@@ -78,6 +81,8 @@ class Mechanics:
 
     def stand(self, surface: HeightField, *, seed: int = 0) -> None:
         """Have this stand on the bed from now on, for what feels contact."""
+        from gcode.firmware.contact import ProbeContact
+
         if self.contact is None:
             self.contact = ProbeContact.of(self.profile.probe, surface, seed=seed)
             self.contact.dead = self.dead_probe
@@ -85,6 +90,8 @@ class Mechanics:
 
     def feel_what_is_laid(self) -> None:
         """Have what this printer itself lays stand on the bed."""
+        from gcode.firmware.laid import Laid
+
         self.laid = Laid(self.profile)
         self.stand(self.laid.surface)
 

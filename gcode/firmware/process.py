@@ -17,6 +17,7 @@ import tempfile
 import threading
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import gcode
 from gcode.errors import LinkError
@@ -24,7 +25,9 @@ from gcode.firmware.faults import FaultScript, parse_faults
 from gcode.firmware.motion import MotionBatch
 from gcode.firmware.serve import FRAME, require_terminals
 from gcode.profiles import PrinterProfile
-from gcode.surfaces import HeightField
+
+if TYPE_CHECKING:
+    from gcode.surfaces import HeightField
 
 EMULATOR_ANSWERS_S = 60.0
 

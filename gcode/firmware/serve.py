@@ -25,7 +25,6 @@ from gcode.errors import InputError
 from gcode.firmware.core import FirmwareCore
 from gcode.firmware.faults import FaultScript
 from gcode.profiles import PrinterProfile
-from gcode.surfaces import HeightField
 
 FRAME = struct.Struct("<cI")
 MOTION_FRAME_NUMBERS = 9 * 2000
@@ -210,6 +209,8 @@ class PtyServer:
         elif what == "reset":
             core.power_up()
         elif what == "stand":
+            from gcode.surfaces import HeightField
+
             core.machine.stand(HeightField.read(Path(str(request["path"]))))
         elif what == "stop":
             self._stopping = True

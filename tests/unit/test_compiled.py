@@ -282,7 +282,7 @@ from gcode.compiled import njit
 
 @njit(cache=True)
 def kernel(points):
-    return np.sort(points.ravel()).mean() + np.linalg.norm(points)
+    return points.sum()
 
 me, folder, others = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
 (folder / f"ready-{me}").touch()
@@ -299,14 +299,14 @@ def test_of_processes_that_start_together_one_compiles(tmp_path: Path) -> None:
     script.write_text(KERNEL)
     running = [
         subprocess.Popen(
-            [sys.executable, str(script), str(k), str(tmp_path), "3"],
+            [sys.executable, str(script), str(k), str(tmp_path), "2"],
             stdout=subprocess.PIPE, text=True, cwd=ROOT,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )
-        for k in range(3)
+        for k in range(2)
     ]  # fmt: skip
     told = [tuple(map(int, one.communicate(timeout=120)[0].split())) for one in running]
-    assert sorted(told) == [(0, 1), (0, 1), (1, 0)]
+    assert sorted(told) == [(0, 1), (1, 0)]
 
 
 def test_a_turn_that_nobody_gives_back_is_waited_for_no_longer(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def test_a_hollow_that_one_scan_alone_saw_into_is_kept() -> None:
     step = difference(box((0, 0, 0), (40, 30, 12)), box((10, 8, 4), (30, 22, 13)))
     clouds = []
     for seed in range(3):
-        points = sample_surface(step.body, 1.0, seed=seed)[0]
+        points = sample_surface(step.body, 1.4, seed=seed)[0]
         points += np.random.default_rng(seed).normal(0.0, 0.03, points.shape)
         floor = (abs(points - (20, 15, 4)) < (9.9, 6.9, 0.5)).all(axis=1)
         shelf = (points[:, 2] > 3.0) & (points[:, 2] < 11.0) & floor

@@ -71,6 +71,13 @@ def test_sending_over_a_cable_loads_nothing_of_the_web(tmp_path: Path) -> None:
     assert not loaded & {"httpx", "websockets", "trimesh", "torch", "open3d", "shapely"}
 
 
+def test_an_emulated_printer_loads_no_kernels() -> None:
+    # regression: of 0.6 s that each one took to start, 0.3 s loaded heights that few printers feel
+    code = f"import sys\nsys.path.insert(0, {str(ROOT)!r})\nimport gcode.firmware.child\n"
+    code += "assert not {'numba', 'scipy'} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_compiled_kernels_do_not_load_what_multiplies_matrices() -> None:
     # regression: numba loaded scipy.linalg with its first kernel, 0.15 s and 15 MB for nothing
     code = (
