@@ -194,13 +194,15 @@ def group_medians(order, start, value):
 
 
 @njit(cache=True, nogil=True)
-def pairs_apart(place, normal, which, least, most, cosine):
-    """(p, 2) pairs of some cells that face the same way, farther apart than one length, by another.
+def differences_apart(place, normal, value, group, patch, which, least, most, cosine, groups):
+    """How much some cells differ that face the same way, farther apart than one length, by another.
 
-    Each pair once, rising.
+    (p,) differences of value, each pair once; (p,) its group, the larger one of the two; and
+    (groups, patches) whether a patch has a cell in a pair of the group.
     """
     many = len(which) * (len(which) - 1) // 2
-    found = np.empty((many, 2), np.int32)
+    off, worse = np.empty(many), np.empty(many, np.int16)
+    touched = np.zeros((groups, patch.max() + 1), np.bool_)
     n = 0
     for p in range(len(which)):
         i = which[p]
@@ -217,9 +219,11 @@ def pairs_apart(place, normal, which, least, most, cosine):
                 + normal[i, 2] * normal[j, 2]
             )  # fmt: skip
             if dot > cosine:
-                found[n, 0], found[n, 1] = i, j
+                k = max(group[i], group[j])
+                off[n], worse[n] = abs(value[i] - value[j]), k
+                touched[k, patch[i]] = touched[k, patch[j]] = True
                 n += 1
-    return found[:n].copy()
+    return off[:n].copy(), worse[:n].copy(), touched
 
 
 @njit(cache=True, nogil=True, parallel=True)

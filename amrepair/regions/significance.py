@@ -275,39 +275,34 @@ def _wander(
     worse one was seen.
     """
     pick = np.arange(0, len(scale), max(len(scale) // options.most_windows, 1))
-    one, other = scales_kernels.pairs_apart(
-        scale.place_mm, scale.normal, pick, 0.5 * options.far_mm, options.far_mm, WINDOW_FACING
-    ).T
-    off_mm = np.abs(scale.median_mm[one] - scale.median_mm[other]) / PAIR_QUARTILE
+    # places farther apart than errors reach: so many tell of them on their own
+    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
+    patch_of = cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
     # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
-    worse = np.maximum(group[one], group[other])
+    off_mm, worse, touched = scales_kernels.differences_apart(
+        scale.place_mm, scale.normal, scale.median_mm, group, patch_of, pick,
+        0.5 * options.far_mm, options.far_mm, WINDOW_FACING, classes,
+    )  # fmt: skip
+    off_mm /= PAIR_QUARTILE
     found = by_class(worse, off_mm, options, share=0.25, classes=classes)
     # a bent part wanders too, but no scanner does so smoothly and so far
     found *= min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
-    return found, _freedom(scale, worse, (one, other), classes, options)
+    pairs = np.bincount(worse, minlength=classes)
+    return found, _freedom(pairs, touched.sum(axis=1), options)
 
 
 def _freedom(
-    scale: Scale,
-    of_pair: Numbers,
-    pairs: tuple[Numbers, Numbers],
-    classes: int,
-    options: RegionOptions,
+    pairs: Int[np.ndarray, " c"], places: Int[np.ndarray, " c"], options: RegionOptions
 ) -> Float[np.ndarray, " c"]:
-    """(c,) degrees of freedom of each class's wander: by places farther apart than errors reach.
+    """(c,) degrees of freedom of each class's wander, by its pairs and the places that they join.
 
     A class too small to be told has those of the one whose value it took.
     """
-    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
-    patch_of = cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
-    freedom = np.empty(classes)
+    freedom = np.empty(len(pairs))
     last = 1.0
-    for k in range(classes):
-        here = of_pair == k
-        if here.sum() >= options.least_cells:
-            in_pairs = np.bincount(patch_of[np.concatenate([each[here] for each in pairs])])
-            places = np.count_nonzero(in_pairs)
-            last = max(PAIRS_EFFICIENCY * (places - 1), 1.0)
+    for k in range(len(pairs)):
+        if pairs[k] >= options.least_cells:
+            last = max(PAIRS_EFFICIENCY * (int(places[k]) - 1), 1.0)
         freedom[k] = last
     return freedom
 

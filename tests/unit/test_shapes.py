@@ -10,6 +10,12 @@ from beartype.roar import BeartypeCallHintViolation
 
 from amrepair import frames
 from amrepair.scans import Scan
+from tests import shapes
+
+
+@pytest.fixture(autouse=True)
+def _every_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shapes, "checked_every", 1)  # other tests may have called it before
 
 
 def test_an_array_of_another_shape_is_refused_in_functions_methods_and_records() -> None:
