@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align import AlignOptions, SoFar
-from amrepair.arrays import Mask, Points
+from amrepair.arrays import Mask, Points, Values
 from amrepair.frames import Transform, unit_vectors
 from amrepair.regions.sites import RoundedUp
 from amrepair.repair.options import RepairOptions
@@ -107,7 +107,10 @@ def _laid_beyond(
     place_mm: Float[np.ndarray, "s 3"],
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
-    """(s,) how far out of what is expected the job's own path may put each place."""
+    """(s,) how far out of what is expected the job's own path may put each place.
+
+    What is seen on or beside supports, within how far strands stray, is no evidence of the part.
+    """
     beyond_mm = np.zeros(len(place_mm))
     some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
     if len(some):
@@ -117,13 +120,30 @@ def _laid_beyond(
             in_build, placed.rotate(normal), deviation_mm[some]
         )
         beyond_mm[some] = offset_mm + tolerance_mm
+        over_mm = site.options.over_beside_mm
         if site.strands is not None:
             top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
-            strand = in_build[:, 2] < top_mm + site.options.over_beside_mm
+            strand = in_build[:, 2] < top_mm + over_mm
             beyond_mm[some] = np.where(
                 strand, np.maximum(beyond_mm[some], site.options.stray_mm), beyond_mm[some]
             )
+        if site.beside is not None:
+            beside = in_build[:, 2] < _highest_around(site.beside, in_build, site.options) + over_mm
+            beyond_mm[some] = np.where(
+                beside, np.maximum(beyond_mm[some], deviation_mm[some]), beyond_mm[some]
+            )
     return np.maximum(beyond_mm, 0.0)
+
+
+def _highest_around(beside: HeightField, in_build: Points, options: RepairOptions) -> Values:
+    """(s,) how high what lies beside the part stands, within how far its strands stray."""
+    around = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 2), axis=-1).reshape(-1, 2)
+    around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1.0)
+    found = [
+        beside.sample(in_build[:, :2] + options.stray_mm * way, outside_mm=-np.inf)
+        for way in around
+    ]
+    return np.asarray(np.max(found, axis=0))
 
 
 def of_layer(scan: Scan, site: Site) -> Scan:

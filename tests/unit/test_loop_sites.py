@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import manifold3d as m3
 import numpy as np
+import pytest
 from loop_bench import solid_mesh
 
 from amrepair.frames import Transform
@@ -32,9 +33,9 @@ def job_of(part: m3.Manifold) -> Job:
     return job_for(write(plan_part(part, SETUP).toolpath, SETUP, title="job").text, SETUP.printer)
 
 
-def looked_at(job: Job, stands: m3.Manifold) -> RepairPlan:
+def looked_at(job: Job, stands: m3.Manifold, drawn: m3.Manifold = BLOCK) -> RepairPlan:
     """What the final look at a part plans."""
-    template = MeshSdf.from_mesh(solid_mesh(BLOCK))
+    template = MeshSdf.from_mesh(solid_mesh(drawn))
     here = Transform.identity("build", "template")
     site = sites(job, template, here, SETUP)(plan_stops(job, [])[-1])
     sensors = np.array([[0.0, 0.0, 300.0], [200.0, 200.0, 300.0], [100.0, 97.0, 300.0]])
@@ -120,3 +121,45 @@ def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
     of_part = np.array([[100.0, 89.8, 1.5]])
     assert (beyond(middle, np.full(len(middle), 0.3)) >= 0.4).all()
     assert (beyond(of_part, np.array([0.3])) < 0.3).all()
+
+
+WALL = m3.Manifold.cube((1.0, 7.0, 5.0)).translate((110.6, 90.0, 0.0))
+BLOBS = {
+    "away from it": m3.Manifold.sphere(2.3, 64).translate((98.0, 90.0, 3.0)),
+    "on a wall beside it": m3.Manifold.sphere(2.4, 64).translate((110.0, 100.0, 3.0)),
+}
+
+
+def beside_a_support() -> tuple[Job, m3.Manifold]:
+    """The job of the block and of a wall that supports nothing; and the two, as they were printed.
+
+    Strands of the wall stick out of it, by more than they stray as far as a scanner can tell.
+    """
+    job = job_of(BLOCK + WALL)
+    role = job.beads.role.copy()
+    role[job.beads.start_mm[:, 0] > 110.3] = len(job.beads.roles)
+    beads = replace(job.beads, role=role, roles=(*job.beads.roles, "Support material"))
+    strands = [
+        m3.Manifold.cube((0.65, 0.6, 0.4)).translate((111.6, y, z))
+        for y in (90.8, 92.6, 94.4)
+        for z in (1.6, 3.0, 4.4)
+    ]
+    return replace(job, beads=beads), m3.Manifold.batch_boolean(
+        [BLOCK, WALL, *strands], m3.OpType.Add
+    )
+
+
+def test_what_supports_show_is_not_too_much_at_the_final_look() -> None:
+    """regression: strands of clean supports were told as 60 to 200 mm³ of the finished part."""
+    job, printed = beside_a_support()
+    assert looked_at(job, printed).deficit.excess_mm3 < 0.1
+
+
+@pytest.mark.parametrize("blob", BLOBS.values(), ids=list(BLOBS))
+def test_what_is_too_much_is_told_beside_supports(blob: m3.Manifold) -> None:
+    job, printed = beside_a_support()
+    excess = looked_at(job, printed + blob).deficit.excess
+    stands_mm3 = (blob - BLOCK).volume()
+    assert stands_mm3 > 20.0
+    assert (excess ^ blob).volume() > 0.7 * stands_mm3
+    assert excess.volume() < 1.3 * stands_mm3
