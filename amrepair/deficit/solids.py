@@ -6,6 +6,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Points, Values, VoxelMask
 from amrepair.deficit.boxes import Box, Sought, boxes_of
@@ -50,7 +51,13 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
     beyond_mm = 2 * float(box.step_mm.max())
     can_be = deep_mm > -beyond_mm
     if sought.is_excess and inside.any():
-        can_be &= f < float(s.deviation_mm[inside].max()) + beyond_mm
+        most_off_mm = float(s.deviation_mm[inside].max()) + beyond_mm
+        can_be &= f < most_off_mm
+        # straight out of the template its surface comes no later than where it is farthest out:
+        # behind a face that hangs from an overhang, where nobody saw, its plane would go on
+        asked = np.flatnonzero(can_be & (f > 0))
+        away_mm = cKDTree(s.place_mm[inside]).query(samples[asked])[0]
+        can_be[asked] = away_mm < most_off_mm - f[asked] + s.cell_mm
         can_be &= samples[:, 2] > float(template.bounds_mm[0, 2])  # nothing stands in the bed
     near = np.flatnonzero(can_be)
     best, cautious = (np.full(len(f), -FAR_MM) for _ in range(2))  # how surely it is so
