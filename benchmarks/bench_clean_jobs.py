@@ -85,6 +85,7 @@ CURA_SETTINGS = {
     "roofing_layer_count": "0", "infill_pattern": "grid", "infill_line_distance": "4",
     "infill_overlap_mm": "0.1", "skin_overlap_mm": "0.05", "material_diameter": "1.75",
     "retraction_amount": "1", "speed_print": "50", "adhesion_type": "none",
+    "skin_edge_support_layers": "0",  # else infill is laid twice on one place
 }  # fmt: skip
 
 
