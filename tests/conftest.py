@@ -54,6 +54,15 @@ def pytest_collection(session: pytest.Session) -> None:
             importlib.import_module(".".join(path.relative_to(here.parent).with_suffix("").parts))
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of tests that draw several times, the first draw belongs to every run, the others to slow."""
+    for item in items:
+        drawn = item.callspec.params.get("seed", 0) if hasattr(item, "callspec") else 0
+        if isinstance(drawn, int) and drawn > 0:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Journals, locks and temporary files belong to the test run, not to the user.

@@ -87,18 +87,27 @@ def _shapes(function: object, module: ModuleType) -> dict[str, object]:
     }
 
 
-def _checked(function: FunctionType, shapes: dict[str, object]) -> Callable[..., Any]:
+def _asked(function: FunctionType, shapes: dict[str, object]) -> FunctionType:
+    """The function with checks of these annotations, and of no others."""
     all_said = function.__annotations__
     function.__annotations__ = shapes
-    inner = beartype(function)
-    function.__annotations__ = all_said
-    calls = itertools.count()
+    try:
+        return beartype(function)
+    finally:
+        function.__annotations__ = all_said
+
+
+def _checked(function: FunctionType, shapes: dict[str, object]) -> Callable[..., Any]:
+    calls, inner = itertools.count(), function
 
     @functools.wraps(function)
     def call(*values: Any, **named: Any) -> Any:
+        nonlocal inner
         call_index = next(calls)
         if call_index > ALL_CHECKED and call_index % checked_every:
             return function(*values, **named)
+        if call_index == 0:  # not before: most of what a worker loads it never calls
+            inner = _asked(function, shapes)
         with jaxtyped("context"):  # one n, one m … for all that this call names
             return inner(*values, **named)
 

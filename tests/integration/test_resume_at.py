@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 from jaxtyping import Float
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "unit"))
-from link_forks import ROOT, until
+from link_forks import until
 
 from gcode.check import find_refusals
 from gcode.cli import main
@@ -131,21 +130,6 @@ def judge(made: Resumption, job: Program, setup: PrintSetup) -> Ran:
     ],
 )
 def test_every_slicers_job_goes_on_move_for_move(name: str, printer: str, layer: int) -> None:
-    """In a process of its own, where no call is checked for its types: ten times as fast."""
-    code = f"from test_resume_at import judge_file; judge_file({name!r}, {printer!r}, {layer})"
-    path = os.pathsep.join((str(ROOT), str(ROOT / "tests" / "unit"), str(Path(__file__).parent)))
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=250,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def judge_file(name: str, printer: str, layer: int) -> None:
     setup = setup_for(printer, fast=name == "orca_slicer")
     text = (Path(str(DATA)) / "gcode" / f"{name}.gcode").read_text(errors="replace")
     job = Program(text, setup.printer.dialect)
