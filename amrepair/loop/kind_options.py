@@ -13,8 +13,9 @@ class KindOptions:
     ----------
     moved_mm, moved_deg
         A calibration is good to a tenth or two; a part that moved farther has come off.
-    shift_layers, shift_share
-        Between two groups of layers: in layers, and as a share of what the walls tell.
+    shift_layers, shift_share, shift_faces
+        Between two groups of layers: in layers, as a share of what the walls tell, and which share
+        of the upper walls face along it: a few points of one place are a chip's.
     least_points, most_points
         Of a surface that tells something, and that are looked at.
     low_wall_mm, high_wall_mm, beside_layer_mm, top_rim_mm
@@ -61,6 +62,7 @@ class KindOptions:
     moved_deg: float = 1.5
     shift_layers: float = 1.0
     shift_share: float = 0.35
+    shift_faces: float = 0.05
     least_points: int = 120
     most_points: int = 6_000
     low_wall_mm: float = 0.8

@@ -208,7 +208,10 @@ def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> TypeGues
     # walls that face along it stand out, and those that face it stand back; one side may be unseen
     bands = options.shift_bands
     ways = [way for way in (1.0, -1.0) if (way * told).max() > bands[0] * jump_mm]
-    moved = bool(ways) and all(_moved_so(way * told, way * seen, bands, options) for way in ways)
+    faces = float((np.abs(told) > bands[0] * jump_mm).mean())
+    moved = faces > options.shift_faces and all(
+        _moved_so(way * told, way * seen, bands, options) for way in ways
+    )
     if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
         sure = _sure(jump_mm, options.shift_layers * layer_mm)
         return TypeGuess(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -112,6 +113,20 @@ def test_a_chip_is_no_shift(wide_rad: float, from_mm: float) -> None:
         lambda angle, z: np.where((np.abs(angle - 1.0) < wide_rad) & (z > from_mm), -1.2, 0.0)
     )
     assert kinds._shifted(chipped, 0.2, USUAL_KINDS) is None
+
+
+def test_what_a_few_points_of_one_place_tell_is_no_shift() -> None:
+    # regression: of a belt idler's top two walls were seen, and five points of a chip in a third
+    round_about = walls_of(lambda angle, z: np.zeros(len(z)))
+    out = np.where(np.abs(round_about.outward) > np.sqrt(0.5), np.sign(round_about.outward), 0.0)
+    upper = round_about.place_mm[:, 2] > 9.0
+    chip = np.flatnonzero(upper & (out[:, 1] < 0.0))[:5]
+    deviation_mm = round_about.deviation_mm.copy()
+    deviation_mm[chip] -= 0.9
+    seen = ~upper | (np.abs(out[:, 0]) > 0.0)
+    seen[chip] = True
+    walls = replace(round_about, deviation_mm=deviation_mm, outward=out).part(seen, 4000)
+    assert kinds._shifted(walls, 0.2, USUAL_KINDS) is None
 
 
 @pytest.mark.parametrize("seen_rad", [3.2, 1.2])
