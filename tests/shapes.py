@@ -98,17 +98,16 @@ def _asked(function: FunctionType, shapes: dict[str, object]) -> FunctionType:
 
 
 def _checked(function: FunctionType, shapes: dict[str, object]) -> Callable[..., Any]:
-    calls, inner = itertools.count(), function
+    calls = itertools.count()
+    # not before the first call: most of what a worker loads it never calls
+    checking = functools.cache(functools.partial(_asked, function, shapes))
 
     @functools.wraps(function)
     def call(*values: Any, **named: Any) -> Any:
-        nonlocal inner
         call_index = next(calls)
         if call_index > ALL_CHECKED and call_index % checked_every:
             return function(*values, **named)
-        if call_index == 0:  # not before: most of what a worker loads it never calls
-            inner = _asked(function, shapes)
         with jaxtyped("context"):  # one n, one m … for all that this call names
-            return inner(*values, **named)
+            return checking()(*values, **named)
 
     return call

@@ -6,13 +6,13 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Points, Values, VoxelMask
 from amrepair.deficit.boxes import Box, Sought, boxes_of
 from amrepair.deficit.voxels import VoxelBox, solids_from_field
 from amrepair.field.as_built import SOLID_MM
 from amrepair.field.near import has_near
+from amrepair.field.places import PlaceTree
 from amrepair.frames import in_box
 from amrepair.observe.background import ON_PLANE_MM
 from gcode.progress import Progress
@@ -56,7 +56,7 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
         # straight out of the template its surface comes no later than where it is farthest out:
         # behind a face that hangs from an overhang, where nobody saw, its plane would go on
         asked = np.flatnonzero(can_be & (f > 0))
-        away_mm = cKDTree(s.place_mm[inside]).query(samples[asked])[0]
+        away_mm = PlaceTree.of(s.place_mm[inside]).nearest(samples[asked], 1)[0][:, 0]
         can_be[asked] = away_mm < most_off_mm - f[asked] + s.cell_mm
         can_be &= samples[:, 2] > float(template.bounds_mm[0, 2])  # nothing stands in the bed
     near = np.flatnonzero(can_be)

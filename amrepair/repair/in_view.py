@@ -119,20 +119,15 @@ def _laid_beyond(
         offset_mm, tolerance_mm = laid.expected_offset_mm(
             in_build, placed.rotate(normal), deviation_mm[some]
         )
-        beyond_mm[some] = offset_mm + tolerance_mm
-        over_mm = site.options.over_beside_mm
+        least_mm, over_mm = np.zeros(len(some)), site.options.over_beside_mm
         if site.strands is not None:
             top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
-            strand = in_build[:, 2] < top_mm + over_mm
-            beyond_mm[some] = np.where(
-                strand, np.maximum(beyond_mm[some], site.options.stray_mm), beyond_mm[some]
-            )
+            least_mm[in_build[:, 2] < top_mm + over_mm] = site.options.stray_mm
         if site.beside is not None:
             beside = in_build[:, 2] < _highest_around(site.beside, in_build, site.options) + over_mm
-            beyond_mm[some] = np.where(
-                beside, np.maximum(beyond_mm[some], deviation_mm[some]), beyond_mm[some]
-            )
-    return np.maximum(beyond_mm, 0.0)
+            least_mm[beside] = np.maximum(least_mm[beside], deviation_mm[some][beside])
+        beyond_mm[some] = np.maximum(offset_mm + tolerance_mm, least_mm)
+    return beyond_mm
 
 
 def _highest_around(beside: HeightField, in_build: Points, options: RepairOptions) -> Values:

@@ -6,9 +6,7 @@ and filled with noise. A million by name (`-m slow`), a share in the suite.
 
 from __future__ import annotations
 
-import os
 import random
-import subprocess
 import sys
 from pathlib import Path
 
@@ -217,19 +215,7 @@ def test_no_number_keeps_the_emulated_printer_busy_for_ever(command: bytes, afte
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("part", range(10))
 def test_a_million_inputs_make_events_and_nothing_else(part: int) -> None:
-    """In a process of its own, where no call is checked for its types: ten times as fast."""
-    unit = Path(__file__).parent.parent / "unit"
-    path = os.pathsep.join((str(unit.parent.parent), str(unit), str(Path(__file__).parent)))
-    code = f"from test_link_fuzz import fuzz; fuzz(100_000, seed={100 + part})"
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=1800,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    fuzz(100_000, seed=100 + part)
 
 
 @settings(max_examples=200)
