@@ -83,17 +83,15 @@ class Sought:
             allowed_mm[asked] = higher_mm[nearest]
         return allowed_mm
 
-    def in_lines_that_hung(self, samples_mm: Points) -> Mask:
-        """(k,) places in lines that are gone and hung over a floor.
+    def in_lines_that_are_gone(self, samples_mm: Points) -> Mask:
+        """(k,) places in lines of the job that are gone.
 
-        The floor under such a line is as designed, and says nothing of the line.
+        The nearest planes are those of what lies below and beside, which stands as designed, and
+        say nothing of the line.
         """
         if self.gone is None:
             return np.zeros(len(samples_mm), bool)
-        held = self.gone.holds(samples_mm)
-        down_mm = np.array([0.0, 0.0, float(np.median(self.gone.height_mm))])
-        held[held] = self.template.distance(samples_mm[held] - down_mm) > 0
-        return held
+        return self.gone.holds(samples_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -75,16 +75,16 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
         core |= (deep_mm > limit_mm / 4) & (cautious > limit_mm)
     ask = np.flatnonzero(can_be & ~core & (deep_mm > thin_mm) & (clip < 0))
     core[ask] = sought.nearest_is_labelled(samples[ask])
-    if sought.gone is not None:
-        maybe = np.flatnonzero(clip < 0)
-        core[maybe] |= sought.gone.holds(samples[maybe])
+    line, maybe = np.zeros_like(core), np.flatnonzero((clip < 0) & ~core)
+    line[maybe] = sought.in_lines_that_are_gone(samples[maybe])
+    core |= line
     if sought.is_excess:
         # one reflection in mid-air is a plane, too, but none that stands out by its label
         found = np.flatnonzero(core)
         core[found] = sought.nearest_is_labelled(samples[found])
     else:
         core = _of_a_region(core, box, sought.told_mm(inside), s.cell_mm)
-    return _grown_back(sought, box, core, clip, f)
+    return _grown_back(sought, box, core & ~line, core & line, clip, f)
 
 
 def _shown(
@@ -98,7 +98,7 @@ def _shown(
     if not sought.is_excess:
         best, cautious = evidence.clearance(samples_mm, f_mm, most_mm)
         best, held = best.copy(), np.flatnonzero(best < 0)
-        held = held[sought.in_lines_that_hung(samples_mm[held])]
+        held = held[sought.in_lines_that_are_gone(samples_mm[held])]
         best[held] = np.maximum(best[held], evidence.rays_say(samples_mm[held]))
         return best, cautious
     out_mm = evidence.surface_clearance(samples_mm, f_mm)
@@ -130,11 +130,18 @@ def _limits(
 
 
 def _grown_back(
-    sought: Sought, box: VoxelBox, core: Mask, clip: Values, f_mm: Values
+    sought: Sought, box: VoxelBox, core: Mask, line: Mask, clip: Values, f_mm: Values
 ) -> list[manifold3d.Manifold]:
-    """The core, grown by what the erosion took and clipped to template minus as-built."""
-    grow_mm = GROW_FACTOR * sought.tau_mm + float(box.step_mm.max())
-    reach = box.distance_to(core.reshape(box.shape)) - grow_mm
+    """The core, grown by what the erosion took and clipped to template minus as-built.
+
+    Nothing was taken of a line of the job that is gone: it is as wide as it was planned.
+    """
+    sample_mm = float(box.step_mm.max())
+    grow_mm = GROW_FACTOR * sought.tau_mm + sample_mm
+    reach = np.minimum(
+        box.distance_to(core.reshape(box.shape)) - grow_mm,
+        box.distance_to(line.reshape(box.shape)) - sample_mm,
+    )
     shaped = clip.reshape(box.shape)
     field = np.maximum(shaped, np.minimum(reach, FAR_MM))
     if not sought.is_excess:

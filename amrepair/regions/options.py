@@ -50,6 +50,9 @@ class SkippedOptions:
         line.
     under_share
         Of a line's width: a ray that meets it so near to its middle ends there.
+    held_places, alike, there_of_alike
+        Places across a line that rest on the layer below or not. How low a line over a rim lies, so
+        many looks at lines held alike tell, of which so many are taken to be there: 50 mm of them.
     held_share
         Of a line's width: with less over what lies below a line hangs; walls that lean are held
         by a sixth.
@@ -87,6 +90,9 @@ class SkippedOptions:
     about: int = 6
     top_share: float = 1.0
     under_share: float = 0.25
+    held_places: int = 5
+    alike: int = 200
+    there_of_alike: float = 0.25
     held_share: float = 0.15
     sunk_layers: int = 3
     sunk_cells: int = 24

@@ -106,12 +106,13 @@ def skipped(
     if not evidence.has_rays or not len(line):
         return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
     # rays alone cost little; only where they say "open" walls and surfaces are asked, too
-    ask = np.flatnonzero(evidence.rays_say(paths.middles_mm) > 0)
-    looks = _Looks.of(paths, ask, beads, evidence, template, options)
+    planned = _Looks.planned(paths)
+    ask = np.flatnonzero(evidence.rays_say(planned.middle_mm) > 0)
+    looks = planned.some(ask).as_laid(beads, evidence, template, options)
     ask, looks = ask[looks.rays_mm > 0], looks.some(looks.rays_mm > 0)
     by_surface = np.full(len(line), -1.0)
     by_both = by_surface.copy()
-    by_surface[ask], by_both[ask] = _shares(looks, scan, evidence, template, options)
+    by_surface[ask], by_both[ask] = _shares(looks, planned, scan, evidence, template, options)
     surface_says = _together(by_surface, paths.path, options.looks_together)
     sure = surface_says >= options.gone_share
     both = _together(by_both, paths.path, options.looks_together)
@@ -270,28 +271,48 @@ class _Looks:
     rays_mm: Values
 
     @classmethod
-    def of(
-        cls, paths: _Paths, ask: Numbers, beads: PlannedBeads, evidence: Evidence,
-        template: Template, options: SkippedOptions,
-    ) -> _Looks:  # fmt: skip
-        """Some of the looks along paths."""
-        lines, line = paths.lines, paths.line[ask]
+    def planned(cls, paths: _Paths) -> _Looks:
+        """Those along paths, as the job has them: of rays nothing is known yet."""
+        lines, line = paths.lines, paths.line
         half_mm, width_mm = 0.5 * lines.height_mm[line], lines.width_mm[line]
         over_mm = (lines.end_mm - lines.start_mm)[line, :2]
         along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
-        middle_mm, sunk_mm = paths.middles_mm[ask], np.zeros(len(ask))
-        if len(ask):
-            middle_mm += _wall_shift(middle_mm, evidence, template, options)
-            top_mm = middle_mm + half_mm[:, None] * UP
+        sunk_mm, rays_mm = np.zeros((2, len(line)))
+        return cls(paths.middles_mm, half_mm, width_mm, along, sunk_mm, rays_mm)
+
+    def as_laid(
+        self, beads: PlannedBeads, evidence: Evidence, template: Template, options: SkippedOptions
+    ) -> _Looks:
+        """Where walls stand and lines on strands lie, and what rays say there."""
+        middle_mm, sunk_mm = self.middle_mm, self.sunk_mm
+        if len(middle_mm):
+            middle_mm = middle_mm + _wall_shift(middle_mm, evidence, template, options)
+            top_mm = middle_mm + self.half_mm[:, None] * UP
             hanging = _Hanging.of(beads, top_mm, template, options)
-            sunk_mm = _sunk_mm(top_mm, width_mm, 2.0 * half_mm, hanging, evidence, options)
+            high_mm = 2.0 * self.half_mm
+            sunk_mm = _sunk_mm(top_mm, self.width_mm, high_mm, hanging, evidence, options)
             middle_mm[:, 2] -= sunk_mm
         rays_mm = evidence.rays_say(middle_mm)
-        return cls(middle_mm, half_mm, width_mm, along, sunk_mm, rays_mm)
+        return replace(self, middle_mm=middle_mm, sunk_mm=sunk_mm, rays_mm=rays_mm)
 
     def some(self, which: Mask | Int[np.ndarray, " q"]) -> _Looks:
         """Some of them."""
         return _Looks(*(getattr(self, each.name)[which] for each in fields(self)))
+
+    def held(self, template: Template, options: SkippedOptions) -> Numbers:
+        """(k,) of so many places across each line how many rest on the layer below.
+
+        None where nothing is below its middle: it hangs.
+        """
+        below_mm = self.middle_mm - 2.0 * self.half_mm[:, None] * UP
+        aside_mm = self.width_mm[:, None] * self.along[:, ::-1] * np.array([-1.0, 1.0])
+        rest = np.zeros((len(below_mm), options.held_places), bool)
+        middles = (np.arange(options.held_places) + 0.5) / options.held_places - 0.5
+        for place, share in enumerate(middles):
+            under_mm = below_mm.copy()
+            under_mm[:, :2] += share * aside_mm
+            rest[:, place] = template.distance(under_mm) <= 0
+        return np.where(rest[:, options.held_places // 2], rest.sum(axis=1), 0)
 
 
 def _wall_shift(
@@ -471,13 +492,15 @@ def _sunk_mm(
 
 
 def _shares(
-    looks: _Looks, scan: Scan, evidence: Evidence, template: Template, options: SkippedOptions
-) -> tuple[Values, Values]:
+    looks: _Looks, planned: _Looks, scan: Scan, evidence: Evidence, template: Template,
+    options: SkippedOptions,
+) -> tuple[Values, Values]:  # fmt: skip
     """(k,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
 
-    Where a line hangs, the floor below it is where it should be whether the line is there or not,
-    and planes and pixels are wider than the gaps beside it: there each ray tells for itself. What
-    nobody looked into is there.
+    Where surfaces say that a line is there and rays that it is open, each ray tells for itself:
+    the nearest planes are those of walls below, as wide as a line, or of the floor below one that
+    hangs, and stand where they should whether the line is there or not. What nobody looked into is
+    there.
     """
     told_mm = evidence.clearance(looks.middle_mm, template.distance(looks.middle_mm))[0]
     known = told_mm > SOLID_MM + 1e-6
@@ -485,10 +508,8 @@ def _shares(
     surface = np.clip(told_mm / seen.half_mm, -1.0, 1.0)
     rays = np.clip(seen.rays_mm / seen.half_mm, -1.0, options.most_share)
     topped = _topped(seen, evidence, options)
-    below_mm = seen.middle_mm - 2.0 * seen.half_mm[:, None] * UP
     asked = np.flatnonzero(~topped & (surface < 0) & (seen.sunk_mm == 0))
-    asked = asked[template.distance(below_mm[asked]) > 0]
-    went = _went_through(seen.some(asked), scan, options)
+    went = _went_through(seen.some(asked), planned, scan, template, options)
     told = asked[np.isfinite(went)]
     surface[told] = rays[told] = went[np.isfinite(went)]
     by_surface, by_both = np.full((2, len(known)), -1.0)
@@ -497,18 +518,62 @@ def _shares(
     return by_surface, by_both
 
 
-def _went_through(looks: _Looks, scan: Scan, options: SkippedOptions) -> Float[np.ndarray, " k"]:
+def _went_through(
+    looks: _Looks, planned: _Looks, scan: Scan, template: Template, options: SkippedOptions
+) -> Float[np.ndarray, " k"]:
     """(k,) of the rays that met the core of a line how many more went on than ended: −1 to 1.
 
-    One that went on ended a line's height below its middle or deeper; what hangs lower than it
-    should is there. NaN where none came. A ray counts where it crosses the height of the line's
-    middle, however far aside the floor lies that it saw: between strands that hang apart slanting
-    rays see all of what is under them.
+    One that went on ended deeper below the line's middle than a line like it sags. NaN where none
+    came.
+    """
+    sag = _sag(looks, planned, scan, template, options)
+    met, deep = _met(looks, scan, options)
+    went = deep > sag[met]
+    on, ended = (np.bincount(met[which], minlength=len(sag)) for which in (went, ~went))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((on - ended) / (on + ended))
+
+
+def _sag(
+    looks: _Looks, planned: _Looks, scan: Scan, template: Template, options: SkippedOptions
+) -> Values:
+    """(k,) how much lower than planned each line lies if it is there, in heights of a line.
+
+    One that rests on the layer below lies where it should, and one that hangs may lie lower by its
+    height. A line over the rim of what is below, as in walls that lean and in cubic infill, spreads
+    over it: how low it lies then, lines about that are held alike tell, of which so many are there.
+    """
+    held, alike = (each.held(template, options) for each in (looks, planned))
+    sag = np.where(held == 0, 1.0, 0.0)
+    z_mm, other_mm = (np.round(each.middle_mm[:, 2], 6) for each in (looks, planned))
+    rim = (held > 0) & (held < options.held_places)
+    for high_mm, held_by in np.unique(np.column_stack([z_mm, held])[rim], axis=0):
+        mine = np.flatnonzero((z_mm == high_mm) & (held == held_by))
+        others = planned.some((other_mm == high_mm) & (alike == held_by))
+        met, deep = _met(others, scan, options)
+        order = np.lexsort((deep, met))
+        which, first, count = np.unique(met[order], return_index=True, return_counts=True)
+        if not len(which):
+            continue
+        lies = 0.5 + deep[order][first + count // 2]
+        near = cKDTree(others.middle_mm[which, :2]).query(
+            looks.middle_mm[mine, :2], k=np.arange(1, min(len(which), options.alike) + 1)
+        )[1]
+        sag[mine] = np.clip(np.quantile(lies[near], options.there_of_alike, axis=1), 0.0, 1.0)
+    return sag
+
+
+def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, Values]:
+    """(r,) looks whose lines' cores rays met, and how deep below the middle each ray ended.
+
+    In heights of a line. A ray counts where it crosses the height of the line's middle, however far
+    aside the floor lies that it saw: between strands that hang apart slanting rays see all of what
+    is under them.
     """
     core_mm = options.under_share * looks.width_mm
     reach_mm = float(np.hypot(core_mm.max(initial=0.0), 0.5 * options.look_step_mm))
-    on, ended = np.zeros((2, len(core_mm)))
     height_mm = np.round(looks.middle_mm[:, 2], 6)
+    found: list[tuple[Numbers, Values]] = [(np.zeros(0, np.int64), np.zeros(0))]
     for z_mm in np.unique(height_mm):
         mine = np.flatnonzero(height_mm == z_mm)
         place_mm, thick_mm = looks.middle_mm[mine], 2.0 * looks.half_mm[mine]
@@ -520,13 +585,12 @@ def _went_through(looks: _Looks, scan: Scan, options: SkippedOptions) -> Float[n
         near, crossing_mm, points_mm = near[met], crossing_mm[met], scan.points_mm[came[met]]
         off_mm = crossing_mm - place_mm[near, :2]
         x, y = looks.along[mine[near]].T
+        deep = (z_mm - points_mm[:, 2]) / thick_mm[near]
         in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[near]]
-        deep_mm = (z_mm - points_mm[:, 2]) / thick_mm[near]
-        on += np.bincount(mine[near[in_core & (deep_mm > 1.0)]], minlength=len(on))
-        there = in_core & (np.abs(deep_mm) <= 1.0)
-        ended += np.bincount(mine[near[there]], minlength=len(on))
-    with np.errstate(invalid="ignore"):
-        return np.asarray((on - ended) / (on + ended))
+        in_core &= deep >= -1.0
+        found.append((mine[near[in_core]], deep[in_core]))
+    which, depths = zip(*found, strict=True)
+    return np.concatenate(which), np.concatenate(depths)
 
 
 def _topped(looks: _Looks, evidence: Evidence, options: SkippedOptions) -> Mask:

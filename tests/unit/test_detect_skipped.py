@@ -16,7 +16,7 @@ from amrepair.regions import detect
 from amrepair.regions.options import USUAL_SKIPPED
 from amrepair.regions.skipped import PlannedBeads, _Paths, _wall_shift, skipped
 from amrepair.scans import Scan
-from amrepair.template import MeshSdf
+from amrepair.template import MeshSdf, PlannedSdf
 from tests import analytic
 
 SIGMA_MM = 0.03
@@ -461,3 +461,84 @@ def test_a_line_of_a_wall_that_leans_lies_no_lower_for_it(
     ]
     long_mm = gone_mm[1] - gone_mm[0]
     assert told_mm == pytest.approx([long_mm, long_mm, 0.0, 0.0], abs=0.75)
+
+
+CELLS_MM = 2.0  # height of the walls between cells of open infill
+
+
+def cells(gone_mm: tuple[float, float]) -> tuple[m3.Manifold, PlannedBeads]:
+    """Cells of open infill on a floor, and their lines: in the last layer of one a stretch gone."""
+    places = np.arange(2.0, 17.0, 3.5)
+    start, end = (
+        np.array([[x, y, z] for z in np.arange(0.8, CELLS_MM + 0.01, HIGH_MM) for y in places])
+        for x in (0.5, 23.5)
+    )
+    solid = m3.Manifold.cube((24.0, 18.0, 0.6))
+    for y in places:
+        wall = m3.Manifold.cube((23.0, WIDE_MM, CELLS_MM - 0.6))
+        solid += wall.translate((0.5, y - WIDE_MM / 2, 0.6))
+    bar = m3.Manifold.cube((gone_mm[1] - gone_mm[0], WIDE_MM, 1.0))
+    solid -= bar.translate((gone_mm[0], places[2] - WIDE_MM / 2, CELLS_MM - HIGH_MM))
+    count = len(start)
+    return solid, PlannedBeads(start, end, np.full(count, WIDE_MM), np.full(count, HIGH_MM))
+
+
+@pytest.mark.parametrize("gone_mm", [(9.0, 9.0), (9.0, 15.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_line_on_a_wall_as_thin_as_itself_is_missed_whole(
+    gone_mm: tuple[float, float], seed: int
+) -> None:
+    # regression: the nearest planes were those of the wall below, which stands where it should:
+    # of lines of open infill that were gone half were not told, and of those told a third of the
+    # plastic
+    solid, beads = cells(gone_mm)
+    section = beads.width_mm * beads.height_mm
+    template = PlannedSdf.from_beads(beads.start_mm, beads.end_mm, section, beads.height_mm)
+    points, who = analytic.ray_scan(solid, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
+    scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
+    anomaly = detect(scan, template, top_z_mm=CELLS_MM)
+    found = compute_deficit(scan, template, anomaly, build_from_template=HERE, beads=beads)
+    true_mm3 = (gone_mm[1] - gone_mm[0]) * WIDE_MM * HIGH_MM
+    assert found.missing_mm3 == pytest.approx(true_mm3, rel=0.2)
+
+
+SAGS_MM = 0.13  # how much lower lines of cubic infill lie, each a third of its width aside
+
+
+def ramps(sags_mm: float, gone_mm: tuple[float, float]) -> tuple[m3.Manifold, PlannedBeads]:
+    """Cubic infill on a floor, three layers high, of which the last has sunk, and its lines."""
+    places = np.arange(2.0, 17.0, 3.5)
+    rows = [(0.6 + HIGH_MM * (k + 1), places + 0.14 * k) for k in range(3)]
+    start, end = (np.array([[x, y, z] for z, aside in rows for y in aside]) for x in (0.5, 23.5))
+    solid = m3.Manifold.cube((24.0, 18.0, 0.6))
+    bar = m3.Manifold.cube((23.0, WIDE_MM, HIGH_MM))
+    for z, aside in rows:
+        down_mm = HIGH_MM + sags_mm * (z == rows[-1][0])
+        for y in aside:
+            solid += bar.translate((0.5, y - WIDE_MM / 2, z - down_mm))
+    hole = m3.Manifold.cube((gone_mm[1] - gone_mm[0], WIDE_MM + 0.02, 1.0))
+    low_mm = rows[-1][0] - HIGH_MM - sags_mm
+    solid -= hole.translate((gone_mm[0], rows[-1][1][2] - WIDE_MM / 2 - 0.01, low_mm))
+    count = len(start)
+    return solid, PlannedBeads(start, end, np.full(count, WIDE_MM), np.full(count, HIGH_MM))
+
+
+@pytest.mark.parametrize("gone_mm", [(9.0, 9.0), (9.0, 15.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_lines_over_a_rim_are_as_low_as_those_like_them(
+    gone_mm: tuple[float, float], seed: int
+) -> None:
+    # regression: all lines of an adaptive cubic infill lay 0.13 mm low, as each spreads over the
+    # rim of the one below, and with rays telling for lines that rest 2.9 mm³ of a clean plate were
+    # missing
+    solid, beads = ramps(SAGS_MM, gone_mm)
+    section = beads.width_mm * beads.height_mm
+    template = PlannedSdf.from_beads(beads.start_mm, beads.end_mm, section, beads.height_mm)
+    points, who = analytic.ray_scan(solid, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
+    scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
+    top_mm = float(beads.start_mm[:, 2].max())
+    evidence = detect(scan, template, top_z_mm=top_mm).evidence
+    assert evidence is not None
+    found = skipped(beads, scan, evidence, template)
+    told_mm = float(np.linalg.norm(found.end_mm - found.start_mm, axis=1).sum())
+    assert told_mm == pytest.approx(gone_mm[1] - gone_mm[0], abs=1.0)
