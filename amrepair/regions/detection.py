@@ -18,7 +18,7 @@ from amrepair.regions.regions import Tested, find_regions
 from amrepair.regions.significance import Level, as_student, tested
 from amrepair.regions.sites import (
     Observed,
-    RoundedUp,
+    OffByJob,
     Sites,
     agreed,
     observed,
@@ -40,7 +40,7 @@ def detect(
     top_z_mm: float | None = None,
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Points, Points] | None = None,
-    rounded_up: RoundedUp | None = None,
+    off_by_job: OffByJob | None = None,
     pose_is_known: bool = False,
     progress: Progress = silent,
 ) -> AnomalyMap:
@@ -61,9 +61,9 @@ def detect(
         What the scan's rays saw (`range_images`), where it is known already.
     surface
         The template's surface points, `spacing_mm` apart, and normals, where they are.
-    rounded_up
-        Of places and their deviations: how far out of the template the process itself was told to
-        go there. So much is not excess.
+    off_by_job
+        Of places and their deviations: how far off the template, on that side, the job's own path
+        may put the surface there. So much is not excess, and not missing.
     pose_is_known
         Nothing of what is seen is taken for a pose that is off.
 
@@ -88,7 +88,7 @@ def detect(
 
     def observe(without: tuple[int, ...]) -> tuple[Observed, Sites]:
         seen = observed(scan, template, options, images, surface, without)
-        return seen, sites_of(seen, options, top_z_mm, rounded_up)
+        return seen, sites_of(seen, options, top_z_mm, off_by_job)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
     whole_part = top_z_mm is None and calibration != NORMAL_NOISE and not pose_is_known

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from amrepair.errors import InputError
 from amrepair.field.options import EvidenceOptions, SurfelOptions
 from amrepair.observe.options import BackgroundOptions
+from amrepair.template.laid import SUNK_LAYERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class SkippedOptions:
         Of a line's width: with less over what lies below a line hangs; walls that lean are held
         by a sixth.
     sunk_layers
-        So many layers over strands that hang lie lower by what strands hang lower: a skin's three.
+        So many layers over strands that hang lie lower by what strands hang lower.
     sunk_cells, least_sunk_cells, sunk_reach_mm, sunk_share
         How much lower, so many of the nearest cells over strands tell, a few at least, no farther
         off: of their depths this quantile, as of lines that are gone the floor lies deeper.
@@ -94,7 +95,7 @@ class SkippedOptions:
     alike: int = 200
     there_of_alike: float = 0.25
     held_share: float = 0.15
-    sunk_layers: int = 3
+    sunk_layers: int = SUNK_LAYERS
     sunk_cells: int = 24
     least_sunk_cells: int = 4
     sunk_reach_mm: float = 2.0

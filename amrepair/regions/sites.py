@@ -28,7 +28,7 @@ from amrepair.template.learned import TOLERATED_SPREADS
 from amrepair.template.port import Template
 
 # Of places in the template's frame and their deviations: a length for each.
-RoundedUp = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
+OffByJob = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
 # Depths below a place are halved so often, and the place is the surface's nearest as long as the
@@ -185,7 +185,7 @@ def _crossed(
 
 
 def sites_of(
-    seen: Observed, options: RegionOptions, top_z_mm: float | None, rounded_up: RoundedUp | None
+    seen: Observed, options: RegionOptions, top_z_mm: float | None, off_by_job: OffByJob | None
 ) -> Sites:
     """Cells and crossed template points, each with what a sound part may depart there."""
     surfels, template, outward = seen.surfels, seen.template, seen.outward
@@ -215,8 +215,9 @@ def sites_of(
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
     unknown = _behind_what_stands(seen, anywhere_mm, options)
     tolerance_mm[:, : len(surfels)][:, unknown] += diagonal(template.bounds_mm)
-    if rounded_up is not None:
-        tolerance_mm[1] += rounded_up(place_mm, value_mm)
+    if off_by_job is not None:
+        side = np.array([value_mm < 0, value_mm > 0])
+        tolerance_mm += np.where(side, off_by_job(place_mm, value_mm), 0.0)
     return Sites(
         cells=len(surfels),
         cell_mm=surfels.cell_mm,

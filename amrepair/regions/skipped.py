@@ -21,6 +21,7 @@ from amrepair.observe.robust import Problem, solve
 from amrepair.regions import skipped_kernels as kernels
 from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
 from amrepair.scans import Scan
+from amrepair.template.laid import strands_hang_lower_mm
 from amrepair.template.port import Template
 from gcode.compiled import read_only
 from gcode.stretches import in_turn, places_to_ends
@@ -471,8 +472,7 @@ def _sunk_mm(
     if not len(which):
         return found_mm
     top_mm, height_mm = top_mm[which], height_mm[which]
-    most_mm = 2.0 * np.sqrt(width_mm[which] * height_mm / np.pi) - height_mm
-    most_mm = np.clip(most_mm, 0.0, 0.5 * height_mm)
+    most_mm = strands_hang_lower_mm(width_mm[which], height_mm)
     place_mm, reach_mm = evidence.surfels.place_mm, options.sunk_reach_mm
     off_mm = cKDTree(top_mm).query(place_mm, distance_upper_bound=reach_mm)[0]
     place_mm = place_mm[np.isfinite(off_mm)]

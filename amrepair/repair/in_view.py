@@ -12,7 +12,7 @@ from jaxtyping import Float
 from amrepair.align import AlignOptions, SoFar
 from amrepair.arrays import Mask, Points, Values
 from amrepair.frames import Transform, unit_vectors
-from amrepair.regions.sites import RoundedUp
+from amrepair.regions.sites import OffByJob
 from amrepair.repair.options import RepairOptions
 from amrepair.repair.site import Site
 from amrepair.scans import Scan
@@ -93,11 +93,29 @@ def _laid_aside(
     return aside
 
 
-def told_to_go_beyond(site: Site, placed: Transform) -> RoundedUp | None:
-    """How far out the job itself goes, as `detect` asks it; with no more than it needs."""
+def off_by_job(site: Site, placed: Transform) -> OffByJob | None:
+    """How far off the job's own path goes, as `detect` asks it; with no more than it needs."""
     if site.laid is None:
         return None
-    return partial(_laid_beyond, site, site.laid, placed)
+    return partial(_off_by_job, site, site.laid, placed)
+
+
+def _off_by_job(
+    site: Site,
+    laid: LaidBeads,
+    placed: Transform,
+    place_mm: Float[np.ndarray, "s 3"],
+    deviation_mm: Float[np.ndarray, " s"],
+) -> Float[np.ndarray, " s"]:
+    """(s,) how far off what is expected, out or in, the job's own path may put each place."""
+    off_mm = _laid_beyond(site, laid, placed, place_mm, deviation_mm)
+    some = np.flatnonzero(deviation_mm < -0.5 * site.allowance_mm)
+    if len(some):
+        normal = unit_vectors(site.expected.distance_and_gradient(place_mm[some])[1])
+        off_mm[some] = laid.sunk_mm(
+            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
+        )
+    return off_mm
 
 
 def _laid_beyond(

@@ -239,7 +239,7 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
         images=laid.images,
         surface=site.surface,
         pose_is_known=laid.known,
-        rounded_up=in_view.told_to_go_beyond(site, laid.placed),
+        off_by_job=in_view.off_by_job(site, laid.placed),
         progress=progress,
     )
 

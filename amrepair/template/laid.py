@@ -22,6 +22,17 @@ from amrepair.template import laid_kernels as kernels
 
 # A slicer cuts in the middle of a layer: tops are rounded by no more than half of one.
 ROUNDED_LAYERS = 0.55
+# So many layers over strands that hang lie lower by what strands hang lower: a skin's three.
+SUNK_LAYERS = 3
+
+
+def strands_hang_lower_mm(width_mm: Values, height_mm: Values) -> Values:
+    """(n,) how much lower than its layer's the plastic of a strand lies: what hangs is round.
+
+    No more than half a layer: what is laid on it fills the grooves between strands first.
+    """
+    round_mm = 2.0 * np.sqrt(width_mm * height_mm / np.pi)
+    return np.clip(round_mm - height_mm, 0.0, 0.5 * height_mm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +273,39 @@ class LaidBeads:
         """(s,) middle of `interval`, and (s,) half its width: an offset and its tolerance."""
         low, high = self.interval(place_mm, normal, deviation_mm)
         return 0.5 * (low + high), 0.5 * (high - low)
+
+    def sunk_mm(
+        self,
+        place_mm: Float[np.ndarray, "s 3"],
+        normal: Float[np.ndarray, "s 3"],
+        deviation_mm: Float[np.ndarray, " s"],
+    ) -> Float[np.ndarray, " s"]:
+        """(s,) how much lower than planned tops may lie that were laid on strands over a gap.
+
+        Of a strand's plastic some lies below its layer, and what is laid on it fills the grooves
+        between strands first: the layers over open infill are all lower. As in `interval`.
+        """
+        o = self.options
+        surface = place_mm - deviation_mm[:, None] * normal
+        found, up = np.zeros(len(surface)), normal[:, 2] >= o.upright
+        for k in range(len(self.top_mm)):
+            near_mm = ROUNDED_LAYERS * float(self.layer_mm[k])
+            at = np.flatnonzero(up & (np.abs(surface[:, 2] - self.top_mm[k]) < near_mm))
+            for lower in range(k, max(k - SUNK_LAYERS - 1, 0) - 1, -1):
+                if not len(at):
+                    break
+                filled = self._fill(lower).at(surface[at], o.cell_mm) > 0.5
+                if lower < k - 1:
+                    found[at[~filled]] = self._strand_mm(lower + 1)
+                at = at[filled]
+        return found
+
+    def _strand_mm(self, k: int) -> float:
+        """How much lower a layer's strands lie where they hang."""
+        mine = slice(int(self.first[k]), int(self.first[k + 1]))
+        high_mm = self.layer_mm[k : k + 1]
+        width_mm = np.median(self.section_mm2[mine], keepdims=True) / high_mm
+        return float(strands_hang_lower_mm(width_mm, high_mm)[0])
 
     def _walls(
         self,

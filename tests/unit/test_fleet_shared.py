@@ -280,7 +280,7 @@ def test_one_that_hangs_ends_and_is_replaced(asking: Asking, own: AnomalyMap, sm
         write_note(asking.desk / JUDGES, judges.note | {"within_s": LONG_S})
         before = judges.processes
         scan = replace(scan_of(small.part), frame="template")
-        assert asking.detector(scan, small.template, rounded_up=fleet_judges.hang) is own
+        assert asking.detector(scan, small.template, off_by_job=fleet_judges.hang) is own
         assert "EOFError" in asking.why[0]  # by the alarm, and not by the limit of who asked
         deadline_s = time.monotonic() + LONG_S
         while judges.processes == before:

@@ -122,7 +122,7 @@ def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
     job = supported()
     template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
     site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
-    beyond = in_view.told_to_go_beyond(site, here)
+    beyond = in_view.off_by_job(site, here)
     assert beyond is not None
     support = job.beads.role == len(job.beads.roles) - 1
     middle = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support] - [0.0, 0.0, 0.1]

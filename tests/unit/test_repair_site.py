@@ -15,7 +15,7 @@ from amrepair.loop import Stop
 from amrepair.loop.sites import sites
 from amrepair.regions.options import RegionOptions
 from amrepair.repair import Site, plan_repair
-from amrepair.repair.in_view import aligning, so_far, told_to_go_beyond
+from amrepair.repair.in_view import aligning, off_by_job, so_far
 from amrepair.scans import Scan
 
 
@@ -81,12 +81,12 @@ def test_a_site_tells_in_its_templates_frame_what_its_job_leaves(small: Small) -
     # our own slicer fills a solid layer to a per cent: 4 mm of it and 2.3 % of filament
     assert (offset + tolerance).max() < 0.25
     assert (offset - tolerance).min() > -0.1
-    beyond = told_to_go_beyond(site, small.placed)
+    beyond = off_by_job(site, small.placed)
     assert beyond is not None
     out_mm = beyond(wall, np.full(9, site.allowance_mm))
     assert out_mm.max() > 0
     assert (beyond(wall, np.zeros(9)) == 0).all()  # what is within the allowance is not asked
-    assert told_to_go_beyond(replace(site, laid=None), small.placed) is None
+    assert off_by_job(replace(site, laid=None), small.placed) is None
 
 
 def test_a_sites_options_reach_every_stage_and_its_results_record_them(small: Small) -> None:

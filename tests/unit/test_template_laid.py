@@ -168,3 +168,29 @@ def test_layers_that_are_laid_are_counted_once_for_all_looks(
     before = len(counted)
     small.interval(*place)
     assert len(counted) > before
+
+
+def skin_over_cells(layers: int) -> LaidBeads:
+    """A frame of solid layers with a gap 12 mm wide along X, and so many layers of skin over it."""
+    beads = laid(40, layers=5 + layers)
+    y, z = beads.start_mm[:, 1], beads.start_mm[:, 2]
+    layer = np.round(z / LAYER_MM).astype(np.int64) - 1
+    keep = (layer >= 5) | (y < 3.0) | (y > 15.0)
+    return LaidBeads.from_beads(
+        beads.start_mm[keep], beads.end_mm[keep], beads.section_mm2[keep], beads.height_mm[keep],
+        layer[keep], options=NO_WANDER,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("layers", "sinks"), [(1, False), (2, True), (4, True), (5, False)])
+def test_the_first_layers_of_a_skin_lie_lower_over_open_cells(layers: int, sinks: bool) -> None:
+    """As much lower as the strands below them are rounder than their layer: by their section."""
+    beads = skin_over_cells(layers)
+    top_mm = (5 + layers) * LAYER_MM
+    place = np.array([[15.0, y, top_mm] for y in (1.5, 9.0, 16.5)])
+    lower = beads.sunk_mm(place, np.tile([0.0, 0.0, 1.0], (3, 1)), np.zeros(3))
+    round_mm = 2.0 * np.sqrt(SPACING_MM * LAYER_MM / np.pi) - LAYER_MM
+    expected = min(round_mm, 0.5 * LAYER_MM) if sinks else 0.0
+    assert lower == pytest.approx([0.0, expected, 0.0])
+    aside = beads.sunk_mm(place, np.tile([0.0, 1.0, 0.0], (3, 1)), np.zeros(3))
+    assert not aside.any()
