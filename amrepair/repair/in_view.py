@@ -109,12 +109,11 @@ def _off_by_job(
 ) -> Float[np.ndarray, " s"]:
     """(s,) how far off what is expected, out or in, the job's own path may put each place."""
     off_mm = _laid_beyond(site, laid, placed, place_mm, deviation_mm)
-    some = np.flatnonzero(deviation_mm < -0.5 * site.allowance_mm)
-    if len(some):
-        normal = unit_vectors(site.expected.distance_and_gradient(place_mm[some])[1])
-        off_mm[some] = laid.sunk_mm(
-            placed.apply(place_mm[some]), placed.rotate(normal), deviation_mm[some]
-        )
+    low = deviation_mm < -0.5 * site.allowance_mm
+    if low.any():
+        normal = unit_vectors(site.expected.distance_and_gradient(place_mm)[1])
+        sunk_mm = laid.sunk_mm(placed.apply(place_mm), placed.rotate(normal), deviation_mm)
+        off_mm[low] = sunk_mm[low]
     return off_mm
 
 

@@ -280,25 +280,38 @@ class LaidBeads:
         normal: Float[np.ndarray, "s 3"],
         deviation_mm: Float[np.ndarray, " s"],
     ) -> Float[np.ndarray, " s"]:
-        """(s,) how much lower than planned tops may lie that were laid on strands over a gap.
+        """(s,) how much lower than planned tops lie that were laid on strands over a gap.
 
         Of a strand's plastic some lies below its layer, and what is laid on it fills the grooves
-        between strands first: the layers over open infill are all lower. As in `interval`.
+        between strands first: the layers over open infill are all lower, by no more than that. By
+        how much tells the median of all of a layer that lies so. As in `interval`.
         """
         o = self.options
         surface = place_mm - deviation_mm[:, None] * normal
         found, up = np.zeros(len(surface)), normal[:, 2] >= o.upright
         for k in range(len(self.top_mm)):
-            near_mm = ROUNDED_LAYERS * float(self.layer_mm[k])
-            at = np.flatnonzero(up & (np.abs(surface[:, 2] - self.top_mm[k]) < near_mm))
-            for lower in range(k, max(k - SUNK_LAYERS - 1, 0) - 1, -1):
-                if not len(at):
-                    break
-                filled = self._fill(lower).at(surface[at], o.cell_mm) > 0.5
-                if lower < k - 1:
-                    found[at[~filled]] = self._strand_mm(lower + 1)
-                at = at[filled]
+            over_mm = self.top_mm[k] - surface[:, 2]
+            at = np.flatnonzero(up & (np.abs(over_mm) < ROUNDED_LAYERS * self.layer_mm[k]))
+            at, most_mm = self._over_strands(k, surface, at)
+            if len(at):
+                lies_mm = float(np.median(over_mm[at] - deviation_mm[at]))
+                found[at] = np.minimum(most_mm, max(lies_mm, 0.0))
         return found
+
+    def _over_strands(
+        self, k: int, surface_mm: Points, at: Int[np.ndarray, " a"]
+    ) -> tuple[Int[np.ndarray, " z"], Float[np.ndarray, " z"]]:
+        """Which of some places on a layer's top lie over strands, and how much lower at most."""
+        over, most_mm = [np.zeros(0, np.int64)], [np.zeros(0)]
+        for lower in range(k, max(k - SUNK_LAYERS - 1, 0) - 1, -1):
+            filled = self._fill(lower).at(surface_mm[at], self.options.cell_mm) > 0.5
+            if lower < k - 1:
+                over.append(at[~filled])
+                most_mm.append(np.full(len(over[-1]), self._strand_mm(lower + 1)))
+            at = at[filled]
+            if not len(at):
+                break
+        return np.concatenate(over), np.concatenate(most_mm)
 
     def _strand_mm(self, k: int) -> float:
         """How much lower a layer's strands lie where they hang."""

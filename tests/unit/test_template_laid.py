@@ -183,14 +183,21 @@ def skin_over_cells(layers: int) -> LaidBeads:
 
 
 @pytest.mark.parametrize(("layers", "sinks"), [(1, False), (2, True), (4, True), (5, False)])
-def test_the_first_layers_of_a_skin_lie_lower_over_open_cells(layers: int, sinks: bool) -> None:
-    """As much lower as the strands below them are rounder than their layer: by their section."""
+@pytest.mark.parametrize("low_mm", [0.0, 0.06, 0.2])
+def test_the_first_layers_of_a_skin_lie_as_low_over_open_cells_as_most_of_it_does(
+    layers: int, sinks: bool, low_mm: float
+) -> None:
+    """At most by what the strands below them are rounder than their layer."""
     beads = skin_over_cells(layers)
     top_mm = (5 + layers) * LAYER_MM
-    place = np.array([[15.0, y, top_mm] for y in (1.5, 9.0, 16.5)])
-    lower = beads.sunk_mm(place, np.tile([0.0, 0.0, 1.0], (3, 1)), np.zeros(3))
+    y = np.array([1.5, *np.linspace(5.0, 13.0, 9), 16.5])
+    gap = (y > 3.0) & (y < 15.0)
+    deviation_mm = np.where(gap, -low_mm, 0.0)
+    deviation_mm[1:4] = -0.3  # a third of the skin is gone: it does not say how low the rest lies
+    place = np.column_stack([np.full_like(y, 15.0), y, top_mm + deviation_mm])
+    lower = beads.sunk_mm(place, np.tile([0.0, 0.0, 1.0], (len(y), 1)), deviation_mm)
     round_mm = 2.0 * np.sqrt(SPACING_MM * LAYER_MM / np.pi) - LAYER_MM
-    expected = min(round_mm, 0.5 * LAYER_MM) if sinks else 0.0
-    assert lower == pytest.approx([0.0, expected, 0.0])
-    aside = beads.sunk_mm(place, np.tile([0.0, 1.0, 0.0], (3, 1)), np.zeros(3))
-    assert not aside.any()
+    expected = min(round_mm, 0.5 * LAYER_MM, low_mm) if sinks else 0.0
+    assert lower[gap] == pytest.approx(expected)
+    assert not lower[~gap].any()
+    assert not beads.sunk_mm(place, np.tile([0.0, 1.0, 0.0], (len(y), 1)), deviation_mm).any()
