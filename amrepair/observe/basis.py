@@ -97,25 +97,29 @@ def shape_columns(place_mm: Points, normal: Points, frame: Frame) -> Float[np.nd
 
 
 def priors(
-    half_extent_mm: Float[np.ndarray, " 3"], views: int
+    half_extent_mm: Float[np.ndarray, " 3"], views: int, *, pose_known: bool = False
 ) -> tuple[Float[np.ndarray, "p q"], dict[str, Int[np.ndarray, " ..."]]]:
     """Return the unknowns' sizes for unknowns in units of their priors, and which are one term.
 
     A part bends along what is longer than it is wide: the prior of a sag goes with the square of
     its length, and towards zero where the part is as thick as it is long. Offsets of views are
-    what they have in common and what they differ by, each with its own prior.
+    what they have in common and what they differ by, each with its own prior. Where the pose is
+    known nothing is taken for it, nor for an offset of all views: what lies off as a whole is off.
     """
     options = USUAL_NUISANCE
+    pose = [options.pose_translation_sigma_mm] * 3 + [options.pose_rotation_sigma_rad] * 3
+    common_mm = options.common_offset_sigma_mm
+    if pose_known:
+        pose, common_mm = [0.0] * 6, 0.0
     h = half_extent_mm / max(float(half_extent_mm[0]), 1e-9)
     slender = [h[i] ** 2 * (1 - (h[j] / max(h[i], 1e-9)) ** 2) for i, j in BOWS]
     bow = options.bow_sigma_mm * np.maximum([*slender, h[1] * slender[2] / max(h[1], 1e-9)], 0.0)
-    pose = [options.pose_translation_sigma_mm] * 3 + [options.pose_rotation_sigma_rad] * 3
     physical = np.diag(np.r_[pose, options.scale_sigma_ratio, bow, np.zeros(views)])
     terms = {"pose": np.arange(6), "scale": np.array([SCALE_AT])}
     terms |= {"bow": np.array([8, 9, 10]), "bow in plane": np.array([7])}
     if views:
         differ = options.view_offset_sigma_mm * helmert(views).T if views > 1 else np.zeros((1, 0))
-        common = np.full((views, 1), options.common_offset_sigma_mm)
+        common = np.full((views, 1), common_mm)
         physical[VIEWS_AT:, VIEWS_AT:] = np.column_stack([differ, common])
         terms["common"] = np.array([VIEWS_AT + views - 1])
     if views > 1:

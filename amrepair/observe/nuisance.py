@@ -186,6 +186,7 @@ def fit_nuisance(
     view: Numbers | None = None,
     tolerance_mm: float,
     correlation_mm: float,
+    pose_known: bool = False,
 ) -> Nuisance:
     """Fit what is common to the whole part or to a whole view.
 
@@ -205,6 +206,8 @@ def fit_nuisance(
         What a sound part may deviate by: larger deviations soon lose their say.
     correlation_mm
         Distance over which the errors' correlation falls to 1/e; 0 where they are independent.
+    pose_known
+        Nothing is taken for a pose that is off, nor for an offset of all views.
 
     Raises
     ------
@@ -227,7 +230,7 @@ def fit_nuisance(
     frame = Frame.of(cells.place_mm)
     shape = shape_columns(cells.place_mm, cells.normal, frame)
     columns = np.column_stack([shape, cells.view[:, None] == np.arange(views)]).astype(float)
-    physical, terms = priors(frame.half_extent_mm, views)
+    physical, terms = priors(frame.half_extent_mm, views, pose_known=pose_known)
     solution, kept, spread = _supported(columns @ physical, terms, cells, tolerance_mm)
     on = physical[:, kept]
     value = on @ solution.unknown

@@ -19,6 +19,7 @@ from amrepair.regions.significance import Level, as_student, tested
 from amrepair.regions.sites import (
     Observed,
     OffByJob,
+    PoseKnown,
     Sites,
     agreed,
     observed,
@@ -41,7 +42,7 @@ def detect(
     images: tuple[RangeImage, ...] | None = None,
     surface: tuple[Points, Points] | None = None,
     off_by_job: OffByJob | None = None,
-    pose_is_known: bool = False,
+    pose: PoseKnown = "free",
     progress: Progress = silent,
 ) -> AnomalyMap:
     """Score and label a scan against its template.
@@ -64,8 +65,10 @@ def detect(
     off_by_job
         Of places and their deviations: how far off the template, on that side, the job's own path
         may put the surface there. So much is not excess, and not missing.
-    pose_is_known
-        Nothing of what is seen is taken for a pose that is off.
+    pose
+        How well the scan's pose is known. Of a part that stands on its bed a bow and what it has
+        shrunk by are told and taken out, but no top that lies higher or lower as a whole. Where the
+        pose is told, as under `top_z_mm`, nothing is.
 
     Raises
     ------
@@ -91,8 +94,8 @@ def detect(
         return seen, sites_of(seen, options, top_z_mm, off_by_job)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
-    whole_part = top_z_mm is None and calibration != NORMAL_NOISE and not pose_is_known
-    seen, sites, nuisance, contradicting = agreed(observe, whole_part, options)
+    held = "told" if top_z_mm is not None else pose
+    seen, sites, nuisance, contradicting = agreed(observe, held, options)
     progress("detect", 1.0, 4.0)
     test = _tested(seen, sites, options, calibration)
     progress("detect", 2.0, 4.0)

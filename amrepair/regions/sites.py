@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,6 +30,9 @@ from amrepair.template.port import Template
 
 # Of places in the template's frame and their deviations: a length for each.
 OffByJob = Callable[[Float[np.ndarray, "s 3"], Float[np.ndarray, " s"]], Float[np.ndarray, " s"]]
+# How well a scan's pose is known: as an alignment leaves it; as that of a part that stands on the
+# bed that is seen with it; or told, so that nothing of the whole part is taken for it.
+PoseKnown = Literal["free", "stands", "told"]
 # A template point is present where scanned surface lies within so many cells of it.
 PRESENT_CELLS = 1.8
 # Depths below a place are halved so often, and the place is the surface's nearest as long as the
@@ -273,19 +277,19 @@ def _behind_what_stands(seen: Observed, tolerance_mm: float, options: RegionOpti
 
 def agreed(
     observe: Callable[[tuple[int, ...]], tuple[Observed, Sites]],
-    whole_part: bool,
+    pose: PoseKnown,
     options: RegionOptions,
 ) -> tuple[Observed, Sites, Nuisance | None, tuple[Contradiction, ...]]:
     """What was observed without views that contradict the others, and without nuisance.
 
-    `whole_part`: what belongs to the whole part or to whole views is told and taken out.
+    What belongs to the whole part or to whole views is told and taken out, unless the pose is told.
     """
     out: tuple[Contradiction, ...] = ()
     while True:
         seen, sites = observe(tuple(one.view for one in out))
         nuisance, shares = None, seen.shares
-        if whole_part:
-            nuisance, sites, shares = _without_nuisance(seen, sites, options)
+        if pose != "told":
+            nuisance, sites, shares = _without_nuisance(seen, sites, pose, options)
         if out or shares is None:
             return seen, sites, nuisance, out
         feet_mm = sites.place_mm[: sites.cells]
@@ -297,7 +301,7 @@ def agreed(
 
 
 def _without_nuisance(
-    seen: Observed, sites: Sites, options: RegionOptions
+    seen: Observed, sites: Sites, pose: PoseKnown, options: RegionOptions
 ) -> tuple[Nuisance, Sites, Shares | None]:
     """What belongs to the whole part or to whole views, and what was seen without it."""
     n, views_known = sites.cells, seen.shares is not None
@@ -313,6 +317,7 @@ def _without_nuisance(
         view=view,
         tolerance_mm=float(np.median(sites.tolerance_mm)),
         correlation_mm=options.correlation_mm,
+        pose_known=pose == "stands",
     )
     share_mm = found.removed_mm(place_mm, normal, view)
     left = replace(told, value_mm=told.value_mm - share_mm)

@@ -28,6 +28,7 @@ from amrepair.frames import Transform
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.calibration import of_touches
+from amrepair.regions.sites import PoseKnown
 from amrepair.repair import in_view
 from amrepair.repair.alike import registration_of_damage
 from amrepair.repair.filling import fillable, lines_of
@@ -136,8 +137,9 @@ class _Laid:
         The scan in the template's frame: all of it, and what is held against the template.
     images
         What rays saw, in the template's frame; None where what is expected ends in mid-air.
-    known
-        The pose was told and not looked for, as that of the printer's own probe.
+    pose
+        How well it is known: told, as that of the printer's own probe; of a part that stands where
+        it was printed, in a scan in the printer's frame; or as the scan alone tells.
     """
 
     registration: Registration
@@ -145,7 +147,7 @@ class _Laid:
     whole: Scan
     judged: Scan
     images: tuple[RangeImage, ...] | None
-    known: bool
+    pose: PoseKnown
 
     def by(self, other: Registration) -> _Laid:
         """The same scan in another pose of the part that it fits as well."""
@@ -197,8 +199,8 @@ def _align(
                 progress=progress,
             )
     placed = site.stands_at(scan, registration)
+    said = site.build_from_template is not None or guess is not None
     if site.printed_z_mm is None:
-        said = site.build_from_template is not None or guess is not None
         printer, raised = site.setup.printer, site.on_fixture
         refuse_impossible(site.template, placed, printer, said=said, raised=raised)
     moved = registration.template_from_scan
@@ -210,7 +212,7 @@ def _align(
         whole,
         in_view.of_layer(in_view.of_the_part(own, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
-        known is not None,
+        "told" if known is not None else "stands" if scan.frame == "build" and said else "free",
     )
 
 
@@ -238,7 +240,7 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
         top_z_mm=in_view.top_of_layer(site),
         images=laid.images,
         surface=site.surface,
-        pose_is_known=laid.known,
+        pose=laid.pose,
         off_by_job=in_view.off_by_job(site, laid.placed),
         progress=progress,
     )

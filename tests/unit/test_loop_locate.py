@@ -303,7 +303,7 @@ def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much() -> None:
         (much,) = found(high(5.3) + blob, laid=True, seed=seed)
         assert much.label is Label.EXCESS
         # half a cell's width of the ridges around it, 0.18 mm high, hangs together with it
-        assert much.volume_mm3 == pytest.approx(16.0 * (5.6 - 5.12), rel=0.12)
+        assert much.volume_mm3 == pytest.approx(16.0 * (5.6 - 5.12), rel=0.13)
 
 
 def test_a_first_layer_over_a_gap_is_pressed_down_by_the_next() -> None:

@@ -199,7 +199,7 @@ def test_detection_forgives_what_normal_parts_differ_by(part: AnalyticTemplate) 
     points, normals = sample_surface(part.body, 0.6, seed=2)
     scan = Scan(points + 0.35 * normals, 0.03, "template", normals)
     # a whole part that is 0.35 mm too large everywhere: by more than it may be, but on the right
-    found = detect(scan, template, calibration=NORMAL_NOISE)
+    found = detect(scan, template, calibration=NORMAL_NOISE, pose="told")
     right, left = points[:, 0] > 22, points[:, 0] < 18
     assert (found.label[left] == int(Label.EXCESS)).mean() > 0.6  # corners are cut by no surface
     assert (found.label[right] == int(Label.OK)).mean() > 0.9  # 0.35 − 3 × 0.1 < 0.16
