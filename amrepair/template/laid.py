@@ -286,15 +286,16 @@ class LaidBeads:
         between strands first: the layers over open infill are all lower, by no more than that. By
         how much tells the median of all of a layer that lies so. As in `interval`.
         """
-        o = self.options
-        surface = place_mm - deviation_mm[:, None] * normal
-        found, up = np.zeros(len(surface)), normal[:, 2] >= o.upright
-        for k in range(len(self.top_mm)):
-            over_mm = self.top_mm[k] - surface[:, 2]
-            at = np.flatnonzero(up & (np.abs(over_mm) < ROUNDED_LAYERS * self.layer_mm[k]))
-            at, most_mm = self._over_strands(k, surface, at)
+        surface, found = place_mm - deviation_mm[:, None] * normal, np.zeros(len(place_mm))
+        rising = np.argsort(surface[:, 2])
+        rising = rising[normal[rising, 2] >= self.options.upright]
+        high_mm, near_mm = surface[rising, 2], ROUNDED_LAYERS * self.layer_mm
+        first = np.searchsorted(high_mm, self.top_mm - near_mm, "right")
+        end = np.searchsorted(high_mm, self.top_mm + near_mm)
+        for k in np.flatnonzero(end > first):
+            at, most_mm = self._over_strands(int(k), surface, rising[first[k] : end[k]])
             if len(at):
-                lies_mm = float(np.median(over_mm[at] - deviation_mm[at]))
+                lies_mm = float(np.median(self.top_mm[k] - surface[at, 2] - deviation_mm[at]))
                 found[at] = np.minimum(most_mm, max(lies_mm, 0.0))
         return found
 
