@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 from scipy import ndimage
 
-from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points, Values
+from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points
+from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
@@ -25,6 +26,7 @@ from amrepair.frames import Transform, box_corners
 from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
+from gcode.compiled import read_only
 from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
@@ -224,9 +226,12 @@ def with_what_stands_out(
     is as high. One that is alone is a reflection in mid-air. Points are in the build frame.
     """
     off_mm = options.off_sigma * sigma_mm
-    out = points_mm
-    for way in OWN_COLUMN_FIRST:
-        out = out[out[:, 2] - off_mm > field.sample(out[:, :2] + off_mm * np.array(way))]
+    out = points_mm[
+        kernels.unexplained(
+            read_only(points_mm), off_mm, off_mm * np.array(OWN_COLUMN_FIRST),
+            field.origin_mm, field.cell_mm, read_only(field.z_mm, np.float64),
+        )
+    ]  # fmt: skip
     if len(out) == 0:
         return field
     # itself is one of them
@@ -325,31 +330,18 @@ def _tops(
     A point alone above the others of its cell, which no neighbouring cell has anything as high as,
     is none: a scanner's stray would keep the nozzle away from all around it.
     """
-    index = grid.cells_of(points_mm[:, :2])
-    inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
-    cell, z_mm = index[inside] @ (grid.shape[1], 1), points_mm[inside, 2]
-    band_mm = options.top_band_mm
-    top_mm, mean_mm, count = _topmost(cell, z_mm, grid.z_mm.size, band_mm)
+    points, band_mm = read_only(points_mm), options.top_band_mm
+    column = kernels.columns(points, grid.origin_mm, grid.cell_mm, *grid.shape)
+    every = np.full(grid.z_mm.size, np.inf)
+    top_mm, mean_mm, count, among = kernels.topmost(column, points, every, band_mm)
     around_mm = ndimage.maximum_filter(
         top_mm.reshape(grid.shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
     ).ravel()
-    among = np.bincount(cell, minlength=grid.z_mm.size)
     alone = (count == 1) & (among > 1) & (around_mm < top_mm - band_mm)
     if alone.any():
-        kept = ~alone[cell] | (z_mm < top_mm[cell])
-        _, mean_mm, count = _topmost(cell[kept], z_mm[kept], grid.z_mm.size, band_mm)
+        below_mm = np.where(alone, top_mm, np.inf)
+        _, mean_mm, count, _ = kernels.topmost(column, points, below_mm, band_mm)
     return mean_mm.reshape(grid.shape), count.reshape(grid.shape) > 0
-
-
-def _topmost(
-    cell: Numbers, z_mm: Values, cells: int, band_mm: float
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
-    """(c,) by cell: the highest point, and the mean and number of those within a band of it."""
-    top_mm = np.full(cells, -np.inf)
-    np.maximum.at(top_mm, cell, z_mm)
-    near = z_mm >= top_mm[cell] - band_mm
-    count = np.bincount(cell[near], minlength=cells)
-    return top_mm, np.bincount(cell[near], z_mm[near], cells) / np.maximum(count, 1), count
 
 
 def _close_gaps(

@@ -188,9 +188,10 @@ def _seen_from_within(
     found, which = np.zeros_like(off), np.flatnonzero(~off)
     facing = surfels.toward_sensors(which)
     assert facing is not None
-    gradient, along = _beside_template(template, surfels, which)
-    back = (unit_vectors(facing) * gradient).sum(axis=1) < options.back_cosine
-    found[which] = (along > options.faces.strip_cosine) & back
+    gradient = _outward(template, surfels, which)
+    # few are: planes cost more than all the rest
+    which = which[(unit_vectors(facing) * gradient).sum(axis=1) < options.back_cosine]
+    found[which] = _along_template(template, surfels, which) > options.faces.strip_cosine
     return found
 
 
@@ -206,14 +207,16 @@ def _strips(template: Template, surfels: Surfels, off: Mask, options: EvidenceOp
         near[touched[touched >= 0]] = True
     which = np.flatnonzero(near & ~off & (surfels.deviation_mm < 0))
     strips = np.zeros_like(off)
-    strips[which] = _beside_template(template, surfels, which)[1] < options.faces.strip_cosine
+    strips[which] = _along_template(template, surfels, which) < options.faces.strip_cosine
     return strips
 
 
-def _beside_template(template: Template, surfels: Surfels, which: Numbers) -> tuple[Points, Values]:
-    """Which way the template's surface faces there, and how much the surfels' planes lie along it.
+def _outward(template: Template, surfels: Surfels, which: Numbers) -> Points:
+    """(q, 3) which way the template's surface faces at some surfels."""
+    return unit_vectors(template.distance_and_gradient(surfels.place_mm[which])[1])
 
-    The second is the cosine between them: 1 along the surface, 0 across it.
-    """
-    gradient = unit_vectors(template.distance_and_gradient(surfels.place_mm[which])[1])
-    return gradient, np.abs((gradient * surfels.planes(which)).sum(axis=1))
+
+def _along_template(template: Template, surfels: Surfels, which: Numbers) -> Values:
+    """(q,) cosine between the template's surface and surfels' planes: 1 along it, 0 across it."""
+    outward = _outward(template, surfels, which)
+    return np.asarray(np.abs((outward * surfels.planes(which)).sum(axis=1)))

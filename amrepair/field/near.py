@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points
@@ -51,12 +51,29 @@ def _beside(
     if len(asked_mm) == 0 or len(points_mm) == 0:
         return np.full(len(asked_mm), -1, dtype=np.int32), np.zeros(len(asked_mm), dtype=np.int32)
     asked, points = (read_only(places) for places in (asked_mm, points_mm))
+    cells = cells_about(asked, points, within_mm)
+    nearest, count = kernels.beside(asked, *cells, within_mm, enough)
+    return nearest, count
+
+
+def cells_about(
+    asked: Points, points: Float[np.ndarray, "m 3"], within_mm: float
+) -> tuple[
+    Int[np.ndarray, " _c"],
+    Float[np.ndarray, "_k 3"],
+    Int[np.ndarray, " _k"],
+    Float[np.ndarray, " 3"],
+    float,
+    Int[np.ndarray, " 3"],
+]:
+    """Points by cells, as `near_kernels.by_cell` has them; the cells' corner, edge and number.
+
+    All points within a distance of a place lie in its own cell and those about it.
+    """
     low, high = box_of(asked)
     size_mm = high - low + 3.0 * within_mm
     # by a hair wider: what rounding puts into the next cell is looked for there
     cell_mm = max(1.0001 * within_mm, float(np.cbrt(np.prod(size_mm) / MOST_NEAR_CELLS)))
     corner = low - 1.0001 * cell_mm  # the lowest place must not round into the empty layer
     shape = np.floor((high - corner) / cell_mm).astype(np.int64) + 2
-    ordered = kernels.by_cell(asked, points, corner, cell_mm, shape)
-    nearest, count = kernels.beside(asked, *ordered, corner, cell_mm, shape, within_mm, enough)
-    return nearest, count
+    return *kernels.by_cell(asked, points, corner, cell_mm, shape), corner, cell_mm, shape

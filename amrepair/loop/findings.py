@@ -6,8 +6,10 @@ the head would run into what stands out. Types and confidence are `kinds`'.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import manifold3d
 import numpy as np
@@ -24,7 +26,7 @@ from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
 from gcode.errors import ReadError
 from gcode.meshes import box_of_solid
-from gcode.moves import Program
+from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.surfaces import HeightField
@@ -95,14 +97,9 @@ def clipped_mm(
 
 
 def hit_mm(
-    job: Job,
-    setup: PrintSetup,
-    excess: manifold3d.Manifold,
-    *,
-    line: int,
-    end_line: int,
+    coming: Program, initial: ModalState, setup: PrintSetup, excess: manifold3d.Manifold
 ) -> float:
-    """How deep the head runs into a solid on lines [line, end_line) of the job; 0 if it clears it.
+    """How deep the head runs into a solid in what is coming of the job; 0 if it clears it.
 
     The checker's own sweep judges, tool head and all.
     """
@@ -114,16 +111,19 @@ def hit_mm(
         y1 + FINDING_MARGIN_MM,
     )
     field = HeightField.from_manifold(excess, EXCESS_CELL_MM, box_mm=box)
-    text = "\n".join(job.program.text.split("\n")[line:end_line]) + "\n"
+    refusals = find_refusals(coming, setup, as_built=field, initial=initial)
+    deep = [float(r.value.split()[0]) for r in refusals if r.what.endswith(_HITS)]
+    return max(deep, default=0.0)
+
+
+def _coming(job: Job, line: int, end_line: int) -> tuple[Program, ModalState] | None:
+    """Lines [line, end_line) of the job and the state before; None where nobody can tell that."""
     try:
         state = job.state_after(line)
     except ReadError:
-        return 0.0
-    refusals = find_refusals(
-        Program(text, job.program.dialect), setup, as_built=field, initial=state
-    )
-    deep = [float(r.value.split()[0]) for r in refusals if r.what.endswith(_HITS)]
-    return max(deep, default=0.0)
+        return None
+    text = "\n".join(job.program.text.split("\n", end_line)[line:end_line]) + "\n"
+    return Program(text, job.program.dialect), state
 
 
 def findings(
@@ -148,6 +148,7 @@ def findings(
         The job's, where it is printed on without those that cannot be repaired.
     """
     end_line = _line_after(job, layer_index, line)
+    coming = functools.cache(partial(_coming, job, line, end_line))
     pieces = plan.deficit.excess.decompose() if not plan.deficit.excess.is_empty() else []
     found = []
     regions = plan.deficit.regions
@@ -161,9 +162,9 @@ def findings(
         if region.label is Label.MISSING:
             reach = reach_of(plan, region.box_mm)
         elif end_line > line and height_mm(region) >= LEAST_HIT_LAYERS * plan.layer_height_mm:
-            piece = matching(pieces, region.box_mm)
-            if piece is not None:
-                hit = hit_mm(job, setup, piece, line=line, end_line=end_line)
+            piece, ahead = matching(pieces, region.box_mm), coming()
+            if piece is not None and ahead is not None:
+                hit = hit_mm(*ahead, setup, piece)
         found.append(
             replace(
                 _alone(region, job, layer_index, plan.layer_height_mm),

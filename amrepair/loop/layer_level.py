@@ -113,13 +113,13 @@ class LayerLevel:
         )
         if not top.any():
             return None
-        cell, of, count = np.unique(
-            np.floor(place_mm[top, :2] / options.patch_mm).astype(np.int64),
-            axis=0,
-            return_inverse=True,
-            return_counts=True,
-        )
-        mean = np.bincount(of.ravel(), weights=over[top], minlength=len(cell)) / count
+        patch = np.floor(place_mm[top, :2] / options.patch_mm).astype(np.int64)
+        low, shape = patch.min(axis=0), np.ptp(patch, axis=0) + 1
+        of = (patch[:, 0] - low[0]) * shape[1] + patch[:, 1] - low[1]
+        count, total_mm = np.bincount(of), np.bincount(of, weights=over[top])
+        seen = np.flatnonzero(count)
+        cell = np.stack(np.divmod(seen, shape[1]), axis=1) + low
+        count, mean = count[seen], total_mm[seen] / count[seen]
         many = count >= options.least_points
         if many.sum() < options.least_patches:
             return None

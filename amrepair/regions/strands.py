@@ -7,13 +7,14 @@ along it there are points enough.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask
 from amrepair.field.fused import Surfels
-from amrepair.field.near import has_near
+from amrepair.field.near import cells_about
 from amrepair.frames import unit_vectors, ways_across
+from amrepair.regions import strands_kernels as kernels
 from amrepair.template.port import Template
+from gcode.compiled import read_only
 
 # To each side of a place: along a strand, across it, and off the surface.
 LONG_MM, WIDE_MM, TALL_MM = 2.5, 0.4, 1.5
@@ -42,24 +43,13 @@ def on_strands(
         return on
     places = surfels.place_mm[asked]
     outward = unit_vectors(template.distance_and_gradient(places)[1])
-    reach_mm = float(np.hypot(LONG_MM, TALL_MM))
-    near = np.flatnonzero(has_near(surfels.place_mm, places, reach_mm))
-    tree = cKDTree(surfels.place_mm[near])
+    turn = np.pi * np.arange(WAYS) / WAYS
+    asked_mm, points_mm = read_only(places), read_only(surfels.place_mm)
+    cells = cells_about(asked_mm, points_mm, float(np.hypot(LONG_MM, TALL_MM)))
     enough = SEEN * 4 * LONG_MM * WIDE_MM / surfels.spacing_mm**2
-    turn = np.pi * np.arange(WAYS)[:, None] / WAYS
-    for place, up, one, other in zip(places, outward, *ways_across(outward), strict=True):
-        beside = near[tree.query_ball_point(place, reach_mm)]
-        off_mm = surfels.place_mm[beside] - place
-        a, b = off_mm @ one, off_mm @ other
-        around = (np.abs(off_mm @ up) <= TALL_MM) & (np.hypot(a, b) <= LONG_MM)
-        strips = around & (np.abs(b * np.cos(turn) - a * np.sin(turn)) < WIDE_MM)
-        points = surfels.count[beside]
-        seen, total_mm = strips @ points, strips @ (points * surfels.deviation_mm[beside])
-        seen = np.where(seen > enough, seen, np.inf)  # of too few the mean says nothing
-        limit_mm = np.maximum(systematic_mm + noise_mm / np.sqrt(seen), LEAST_RIDGE_MM)
-        over_mm = total_mm / seen - limit_mm
-        if over_mm.max() > 0:
-            # as all cells of a window are part of a region, all that `maybe` belong to it are
-            own = beside[strips[over_mm.argmax()]]
-            on[own[maybe[own]]] = True
-    return on
+    return kernels.on_strips(
+        asked_mm, (outward, *ways_across(outward)),
+        np.stack([np.cos(turn), np.sin(turn)], axis=1), cells,
+        surfels.count, surfels.deviation_mm, maybe, (LONG_MM, WIDE_MM, TALL_MM),
+        (enough, systematic_mm, noise_mm, LEAST_RIDGE_MM),
+    )  # fmt: skip

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.ndimage import uniform_filter
 
 from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import TemplateError
@@ -99,8 +98,8 @@ class _Fill:
 class KeptFills:
     """Plastic of a job's layers, made once for all looks at it: what is laid stays as it is.
 
-    What does not fit into so much memory is made anew at each look, and so is what another process
-    asks for.
+    The lowest go where there is no more memory: looks at one layer after another ask for the
+    highest few, and one at the finished part for all. Another process makes its own.
     """
 
     def __init__(self, most_bytes: int = 256 * 1024**2) -> None:
@@ -114,10 +113,10 @@ class KeptFills:
         """Of a layer by its index and its number of beads; made where it is not there yet."""
         found = self._found.get(layer)
         if found is None:
-            found = make()
-            if found.bytes <= self._room:
-                self._room -= found.bytes
-                self._found[layer] = found
+            found = self._found[layer] = make()
+            self._room -= found.bytes
+            while self._room < 0:
+                self._room += self._found.pop(min(self._found)).bytes
         return found
 
 
@@ -384,5 +383,5 @@ class LaidBeads:
         nx, ny = (int(n) for n in np.ceil(size / o.cell_mm))
         volume, widest = kernels.plastic(start, end, section, wide, low, o.cell_mm, ny, nx)
         over = 2 * int(0.5 * o.blur_mm / o.cell_mm) + 1
-        ratio = uniform_filter(volume / (o.cell_mm**2 * h), over, mode="constant")
-        return _Fill(ratio.astype(np.float32), widest.astype(np.float32), low)
+        ratio = kernels.averaged(volume / (o.cell_mm**2 * h), over)
+        return _Fill(ratio, widest.astype(np.float32), low)

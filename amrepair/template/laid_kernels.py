@@ -41,6 +41,37 @@ def plastic(start, end, section, width, corner, cell, ny, nx):
     return found, widest
 
 
+@njit(cache=True, nogil=True)
+def averaged(field, over):
+    """(ny, nx) mean over so many cells each way, an odd number; nothing lies outside.
+
+    Sums run along columns and rows, as those of `scipy.ndimage.uniform_filter`, to the last bit,
+    without an array between them.
+    """
+    ny, nx = field.shape
+    half = over // 2
+    out = np.empty((ny, nx), np.float32)
+    down, along, none = np.zeros(nx), np.zeros(nx + over), np.zeros(nx)
+    for y in range(min(half + 1, ny)):
+        down += field[y]
+    for y in range(ny):
+        if y > 0:
+            new = field[y + half] if y + half < ny else none
+            old = field[y - half - 1] if y > half else none
+            for x in range(nx):
+                down[x] += new[x] - old[x]
+        for x in range(nx):
+            along[half + x] = down[x] / over
+        total = 0.0
+        for x in range(over):
+            total += along[x]
+        out[y, 0] = total / over
+        for x in range(1, nx):
+            total += along[x + over - 1] - along[x - 1]
+            out[y, x] = total / over
+    return out
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _at(field, gx, gy):
     """Between cell middles; 0 outside of the grid."""

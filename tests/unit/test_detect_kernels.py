@@ -7,13 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from amrepair.deficit.heights import _tops
+from amrepair.deficit import heights_kernels
+from amrepair.deficit.heights import OWN_COLUMN_FIRST, _tops
 from amrepair.deficit.options import HeightOptions
 from amrepair.field import faces_kernels
 from amrepair.field.fused import make_surfels
 from amrepair.field.places import PlaceTree
 from amrepair.regions.strands import on_strands
 from amrepair.scans import Scan
+from gcode.compiled import read_only
 from gcode.surfaces import HeightField
 from tests import analytic
 
@@ -99,6 +101,20 @@ def test_columns_are_as_high_as_their_topmost_points(seed: int) -> None:
             near = near[near >= near.max() - 0.3]
         if len(own):
             np.testing.assert_allclose(mean[y, x], near.mean())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_what_stands_out_is_over_every_column_about_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-0.5, -0.5, 0.0], [3.5, 2.5, 2.0], (300, 3))
+    field = HeightField(np.zeros(2), 0.5, rng.uniform(0.0, 2.0, (4, 6)), np.ones((4, 6), bool))
+    steps = 0.2 * np.array(OWN_COLUMN_FIRST)
+    around_mm = [field.sample(points[:, :2] + step) for step in steps]
+    out = heights_kernels.unexplained(
+        read_only(points), 0.2, steps, field.origin_mm, field.cell_mm, read_only(field.z_mm)
+    )
+    np.testing.assert_array_equal(out, points[:, 2] - 0.2 > np.max(around_mm, axis=0))
 
 
 @settings(max_examples=15, deadline=None)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from jaxtyping import Float
+from scipy.ndimage import uniform_filter
 
 from amrepair.errors import TemplateError
 from amrepair.frames import rotation_from_vector
@@ -201,3 +202,24 @@ def test_the_first_layers_of_a_skin_lie_as_low_over_open_cells_as_most_of_it_doe
     assert lower[gap] == pytest.approx(expected)
     assert not lower[~gap].any()
     assert not beads.sunk_mm(place, np.tile([0.0, 1.0, 0.0], (len(y), 1)), deviation_mm).any()
+
+
+def test_the_highest_layers_are_kept_where_memory_is_short() -> None:
+    """Looks at one layer after another make the newest alone; a walk over all makes the lower."""
+    job = laid(8, fill=1.1, layers=10)
+    ones = [job._filled(k, slice(int(job.first[k]), int(job.first[k + 1]))) for k in range(3)]
+    kept = KeptFills(most_bytes=2 * ones[0].bytes)
+    for k in (0, 1, 2):
+        kept.get((k, 1), lambda k=k: ones[k])
+    made: list[int] = []
+    for k in (0, 1, 2):
+        kept.get((k, 1), lambda k=k: made.append(k) or ones[k])
+    assert made == [0]
+
+
+@pytest.mark.parametrize("shape", [(40, 31), (2, 9), (7, 1)])
+@pytest.mark.parametrize("over", [1, 3, 5])
+def test_cells_are_averaged_as_by_scipy(shape: tuple[int, int], over: int) -> None:
+    field = np.random.default_rng(over).random(shape)
+    expected = uniform_filter(field, over, mode="constant").astype(np.float32)
+    np.testing.assert_array_equal(laid_kernels.averaged(field, over), expected)
