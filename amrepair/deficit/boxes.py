@@ -28,6 +28,8 @@ class Sought:
     ----------
     gone
         Lines of the job that are not there; None where there are none, and for excess.
+    by_rays
+        Stretches of them of which surfaces alone do not say so.
     """
 
     template: Template
@@ -35,6 +37,7 @@ class Sought:
     anomaly: AnomalyMap
     label: Label
     gone: PlannedBeads | None
+    by_rays: PlannedBeads | None
     options: DeficitOptions
 
     @property
@@ -84,14 +87,18 @@ class Sought:
         return allowed_mm
 
     def in_lines_that_are_gone(self, samples_mm: Points) -> Mask:
-        """(k,) places in lines of the job that are gone.
+        """(k,) places in lines of the job that are gone."""
+        none = np.zeros(len(samples_mm), bool)
+        return none if self.gone is None else self.gone.holds(samples_mm)
+
+    def in_lines_by_rays(self, samples_mm: Points) -> Mask:
+        """(k,) places in lines of which rays alone say that they are gone.
 
         The nearest planes are those of what lies below and beside, which stands as designed, and
         say nothing of the line.
         """
-        if self.gone is None:
-            return np.zeros(len(samples_mm), bool)
-        return self.gone.holds(samples_mm)
+        none = np.zeros(len(samples_mm), bool)
+        return none if self.by_rays is None else self.by_rays.holds(samples_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,7 +29,7 @@ from amrepair.frames import Transform, box_of, boxes_meet, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
-from amrepair.regions.skipped import PlannedBeads, skipped
+from amrepair.regions.skipped import PlannedBeads, against_surfaces, skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -161,9 +161,10 @@ def compute_deficit(
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
         options=options.heights,
     )  # fmt: skip
+    by_rays = None if lines is None else against_surfaces(lines, evidence, template)
     sought = [
-        Sought(template, evidence, anomaly, label, gone, options)
-        for label, gone in ((Label.MISSING, lines), (Label.EXCESS, None))
+        Sought(template, evidence, anomaly, label, *gone, options)
+        for label, gone in ((Label.MISSING, (lines, by_rays)), (Label.EXCESS, (None, None)))
     ]
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
         many = _roughly_missing(anomaly, evidence) > options.early_mm3

@@ -98,7 +98,7 @@ def _shown(
     if not sought.is_excess:
         best, cautious = evidence.clearance(samples_mm, f_mm, most_mm)
         best, held = best.copy(), np.flatnonzero(best < 0)
-        held = held[sought.in_lines_that_are_gone(samples_mm[held])]
+        held = held[sought.in_lines_by_rays(samples_mm[held])]
         best[held] = np.maximum(best[held], evidence.rays_say(samples_mm[held]))
         return best, cautious
     out_mm = evidence.surface_clearance(samples_mm, f_mm)

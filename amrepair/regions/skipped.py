@@ -65,6 +65,15 @@ class PlannedBeads:
             self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
         )
 
+    def pieces(self, long_mm: float) -> PlannedBeads:
+        """The same lines in pieces, each at most so long."""
+        over_mm = self.end_mm - self.start_mm
+        count = np.ceil(np.linalg.norm(over_mm, axis=1) / long_mm).astype(np.int64)
+        of, number = in_turn(np.maximum(count, 1))
+        step_mm = (over_mm / np.maximum(count, 1)[:, None])[of]
+        start_mm = self.start_mm[of] + number[:, None] * step_mm
+        return replace(self.some(of), start_mm=start_mm, end_mm=start_mm + step_mm)
+
     def samples_mm(self, step_mm: float) -> Points:
         """(p, 3) places along the middles of their tops, at most so far apart."""
         return places_to_ends(self.start_mm, self.end_mm, step_mm)[0]
@@ -133,6 +142,20 @@ def skipped(
     kept = paths.kept(gone | likely, sure, least_mm)
     grows = np.minimum(by_both, by_surface + options.there_share)
     return paths.stretches(paths.grown(kept, grows, options))
+
+
+def against_surfaces(
+    gone: PlannedBeads,
+    evidence: Evidence,
+    template: Template,
+    options: SkippedOptions = USUAL_SKIPPED,
+) -> PlannedBeads:
+    """Stretches of lines that are gone of which the surfaces seen alone do not say so."""
+    pieces = gone.pieces(options.look_step_mm)
+    half_mm = 0.5 * pieces.height_mm
+    middle_mm = 0.5 * (pieces.start_mm + pieces.end_mm) - half_mm[:, None] * UP
+    open_mm = evidence.clearance(middle_mm, template.distance(middle_mm))[0]
+    return pieces.some(open_mm < options.gone_share * half_mm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -521,17 +544,16 @@ def _shares(
 def _went_through(
     looks: _Looks, planned: _Looks, scan: Scan, template: Template, options: SkippedOptions
 ) -> Float[np.ndarray, " k"]:
-    """(k,) of the rays that met the core of a line how many more went on than ended: −1 to 1.
+    """(k,) how open a line is by the mean of the rays that met its core, in halves of a line.
 
-    One that went on ended deeper below the line's middle than a line like it sags. NaN where none
-    came.
+    From −1, where they ended on its top, to 1, on the floor, each as low as a line like it sags.
+    NaN where none came.
     """
     sag = _sag(looks, planned, scan, template, options)
     met, deep = _met(looks, scan, options)
-    went = deep > sag[met]
-    on, ended = (np.bincount(met[which], minlength=len(sag)) for which in (went, ~went))
+    open_by = np.clip(2.0 * (deep - sag[met]), -1.0, 1.0)
     with np.errstate(invalid="ignore"):
-        return np.asarray((on - ended) / (on + ended))
+        return np.bincount(met, open_by, len(sag)) / np.bincount(met, minlength=len(sag))
 
 
 def _sag(

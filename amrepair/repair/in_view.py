@@ -112,7 +112,7 @@ def _off_by_job(
     low = deviation_mm < -0.5 * site.allowance_mm
     if low.any():
         normal = unit_vectors(site.expected.distance_and_gradient(place_mm)[1])
-        sunk_mm = laid.sunk_mm(placed.apply(place_mm), placed.rotate(normal), deviation_mm)
+        sunk_mm = laid.sunk_mm(placed.apply(place_mm), placed.rotate(normal), deviation_mm, low)
         off_mm[low] = sunk_mm[low]
     return off_mm
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import TemplateError
@@ -278,12 +278,14 @@ class LaidBeads:
         place_mm: Float[np.ndarray, "s 3"],
         normal: Float[np.ndarray, "s 3"],
         deviation_mm: Float[np.ndarray, " s"],
+        asked: Bool[np.ndarray, " s"],
     ) -> Float[np.ndarray, " s"]:
         """(s,) how much lower than planned tops lie that were laid on strands over a gap.
 
         Of a strand's plastic some lies below its layer, and what is laid on it fills the grooves
         between strands first: the layers over open infill are all lower, by no more than that. By
-        how much tells the median of all of a layer that lies so. As in `interval`.
+        how much tells the median of all of a layer that lies so, where any of it is asked for. As
+        in `interval`.
         """
         surface, found = place_mm - deviation_mm[:, None] * normal, np.zeros(len(place_mm))
         rising = np.argsort(surface[:, 2])
@@ -291,20 +293,25 @@ class LaidBeads:
         high_mm, near_mm = surface[rising, 2], ROUNDED_LAYERS * self.layer_mm
         first = np.searchsorted(high_mm, self.top_mm - near_mm, "right")
         end = np.searchsorted(high_mm, self.top_mm + near_mm)
-        for k in np.flatnonzero(end > first):
-            at, most_mm = self._over_strands(int(k), surface, rising[first[k] : end[k]])
+        low = np.concatenate([[0], np.cumsum(asked[rising])])
+        fills: dict[int, _Fill] = {}  # of the layers below the last one that was asked for
+        for k in np.flatnonzero(low[end] > low[first]):
+            fills = {below: fills[below] for below in fills if below >= k - SUNK_LAYERS - 1}
+            at, most_mm = self._over_strands(int(k), surface, rising[first[k] : end[k]], fills)
             if len(at):
                 lies_mm = float(np.median(self.top_mm[k] - surface[at, 2] - deviation_mm[at]))
                 found[at] = np.minimum(most_mm, max(lies_mm, 0.0))
         return found
 
     def _over_strands(
-        self, k: int, surface_mm: Points, at: Int[np.ndarray, " a"]
+        self, k: int, surface_mm: Points, at: Int[np.ndarray, " a"], fills: dict[int, _Fill]
     ) -> tuple[Int[np.ndarray, " z"], Float[np.ndarray, " z"]]:
         """Which of some places on a layer's top lie over strands, and how much lower at most."""
         over, most_mm = [np.zeros(0, np.int64)], [np.zeros(0)]
         for lower in range(k, max(k - SUNK_LAYERS - 1, 0) - 1, -1):
-            filled = self._fill(lower).at(surface_mm[at], self.options.cell_mm) > 0.5
+            if lower not in fills:
+                fills[lower] = self._fill(lower)
+            filled = fills[lower].at(surface_mm[at], self.options.cell_mm) > 0.5
             if lower < k - 1:
                 over.append(at[~filled])
                 most_mm.append(np.full(len(over[-1]), self._strand_mm(lower + 1)))

@@ -196,12 +196,12 @@ def test_the_first_layers_of_a_skin_lie_as_low_over_open_cells_as_most_of_it_doe
     deviation_mm = np.where(gap, -low_mm, 0.0)
     deviation_mm[1:4] = -0.3  # a third of the skin is gone: it does not say how low the rest lies
     place = np.column_stack([np.full_like(y, 15.0), y, top_mm + deviation_mm])
-    lower = beads.sunk_mm(place, np.tile([0.0, 0.0, 1.0], (len(y), 1)), deviation_mm)
+    lower = beads.sunk_mm(place, np.tile([0.0, 0.0, 1.0], (len(y), 1)), deviation_mm, gap)
     round_mm = 2.0 * np.sqrt(SPACING_MM * LAYER_MM / np.pi) - LAYER_MM
     expected = min(round_mm, 0.5 * LAYER_MM, low_mm) if sinks else 0.0
     assert lower[gap] == pytest.approx(expected)
     assert not lower[~gap].any()
-    assert not beads.sunk_mm(place, np.tile([0.0, 1.0, 0.0], (len(y), 1)), deviation_mm).any()
+    assert not beads.sunk_mm(place, np.tile([0.0, 1.0, 0.0], (len(y), 1)), deviation_mm, gap).any()
 
 
 def test_the_highest_layers_are_kept_where_memory_is_short() -> None:
