@@ -161,7 +161,9 @@ def compute_deficit(
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
         options=options.heights,
     )  # fmt: skip
-    by_rays = None if lines is None else against_surfaces(lines, evidence, template)
+    by_rays = None
+    if lines is not None:
+        by_rays = against_surfaces(lines, evidence, template, options.skipped)
     sought = [
         Sought(template, evidence, anomaly, label, *gone, options)
         for label, gone in ((Label.MISSING, (lines, by_rays)), (Label.EXCESS, (None, None)))
