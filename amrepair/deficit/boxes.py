@@ -29,7 +29,7 @@ class Sought:
     gone
         Lines of the job that are not there; None where there are none, and for excess.
     by_rays
-        Stretches of them of which surfaces alone do not say so.
+        Stretches of them of which rays alone say so.
     """
 
     template: Template

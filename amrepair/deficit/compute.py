@@ -29,7 +29,7 @@ from amrepair.frames import Transform, box_of, boxes_meet, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
-from amrepair.regions.skipped import PlannedBeads, against_surfaces, skipped
+from amrepair.regions.skipped import PlannedBeads, skipped_by
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -155,15 +155,12 @@ def compute_deficit(
     """
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
-    evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
+    evidence, lines, by_rays = _evidence_of(scan, template, anomaly, beads, options.skipped)
     look = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
         options=options.heights,
     )  # fmt: skip
-    by_rays = None
-    if lines is not None:
-        by_rays = against_surfaces(lines, evidence, template, options.skipped)
     sought = [
         Sought(template, evidence, anomaly, label, *gone, options)
         for label, gone in ((Label.MISSING, (lines, by_rays)), (Label.EXCESS, (None, None)))
@@ -204,15 +201,21 @@ def _evidence_of(
     anomaly: AnomalyMap,
     beads: PlannedBeads | None,
     options: SkippedOptions,
-) -> tuple[Evidence, PlannedBeads | None]:
-    """What is known of space, also around lines of the job that are gone; and those lines."""
+) -> tuple[Evidence, PlannedBeads | None, PlannedBeads | None]:
+    """What is known of space, also around lines of the job that are gone; and those lines.
+
+    Of the lines all, and the stretches of which rays alone say that they are gone.
+    """
     evidence = anomaly.evidence
     assert evidence is not None
-    lines = None if beads is None else skipped(beads, scan, evidence, template, options)
-    if lines is None or not len(lines.width_mm):
-        return evidence, None
+    if beads is None:
+        return evidence, None, None
+    lines, by_rays = skipped_by(beads, scan, evidence, template, options)
+    if not len(lines.width_mm):
+        return evidence, None, None
     labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
-    return with_stubs(evidence, lines.samples_mm(options.look_step_mm), labelled), lines
+    about = with_stubs(evidence, lines.samples_mm(options.look_step_mm), labelled)
+    return about, lines, by_rays
 
 
 def _in_build_frame(

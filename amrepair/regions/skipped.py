@@ -65,15 +65,6 @@ class PlannedBeads:
             self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
         )
 
-    def pieces(self, long_mm: float) -> PlannedBeads:
-        """The same lines in pieces, each at most so long."""
-        over_mm = self.end_mm - self.start_mm
-        count = np.ceil(np.linalg.norm(over_mm, axis=1) / long_mm).astype(np.int64)
-        of, number = in_turn(np.maximum(count, 1))
-        step_mm = (over_mm / np.maximum(count, 1)[:, None])[of]
-        start_mm = self.start_mm[of] + number[:, None] * step_mm
-        return replace(self.some(of), start_mm=start_mm, end_mm=start_mm + step_mm)
-
     def samples_mm(self, step_mm: float) -> Points:
         """(p, 3) places along the middles of their tops, at most so far apart."""
         return places_to_ends(self.start_mm, self.end_mm, step_mm)[0]
@@ -102,7 +93,18 @@ def skipped(
     template: Template,
     options: SkippedOptions = USUAL_SKIPPED,
 ) -> PlannedBeads:
-    """Stretches of beads that are not there.
+    """Stretches of beads that are not there: the first of `skipped_by`."""
+    return skipped_by(beads, scan, evidence, template, options)[0]
+
+
+def skipped_by(
+    beads: PlannedBeads,
+    scan: Scan,
+    evidence: Evidence,
+    template: Template,
+    options: SkippedOptions = USUAL_SKIPPED,
+) -> tuple[PlannedBeads, PlannedBeads]:
+    """Stretches of beads that are not there, and those of them of which rays alone say so.
 
     Parameters
     ----------
@@ -114,15 +116,18 @@ def skipped(
     paths = _Paths.of(beads, options)
     lines, line = paths.lines, paths.line
     if not evidence.has_rays or not len(line):
-        return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
+        none = lines.some(np.zeros(len(lines.width_mm), dtype=bool))
+        return none, none
     # rays alone cost little; only where they say "open" walls and surfaces are asked, too
     planned = _Looks.planned(paths)
     ask = np.flatnonzero(evidence.rays_say(planned.middle_mm) > 0)
     looks = planned.some(ask).as_laid(beads, evidence, template, options)
     ask, looks = ask[looks.rays_mm > 0], looks.some(looks.rays_mm > 0)
     by_surface = np.full(len(line), -1.0)
-    by_both = by_surface.copy()
-    by_surface[ask], by_both[ask] = _shares(looks, planned, scan, evidence, template, options)
+    by_both, by_rays = by_surface.copy(), np.zeros(len(line), dtype=bool)
+    by_surface[ask], by_both[ask], by_rays[ask] = _shares(
+        looks, planned, scan, evidence, template, options
+    )
     surface_says = _together(by_surface, paths.path, options.looks_together)
     sure = surface_says >= options.gone_share
     both = _together(by_both, paths.path, options.looks_together)
@@ -131,7 +136,7 @@ def skipped(
     kept = paths.kept(gone, sure, np.full(len(line), options.least_stretch_mm))
     found = paths.stretches(kept)
     if not len(found.width_mm):
-        return found
+        return found, found
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
     off_mm = np.abs(high_mm[:, None] - np.unique(slipped_mm))
@@ -141,21 +146,8 @@ def skipped(
     least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
     kept = paths.kept(gone | likely, sure, least_mm)
     grows = np.minimum(by_both, by_surface + options.there_share)
-    return paths.stretches(paths.grown(kept, grows, options))
-
-
-def against_surfaces(
-    gone: PlannedBeads,
-    evidence: Evidence,
-    template: Template,
-    options: SkippedOptions = USUAL_SKIPPED,
-) -> PlannedBeads:
-    """Stretches of lines that are gone of which the surfaces seen alone do not say so."""
-    pieces = gone.pieces(options.look_step_mm)
-    half_mm = 0.5 * pieces.height_mm
-    middle_mm = 0.5 * (pieces.start_mm + pieces.end_mm) - half_mm[:, None] * UP
-    open_mm = evidence.clearance(middle_mm, template.distance(middle_mm))[0]
-    return pieces.some(open_mm < options.gone_share * half_mm)
+    kept = paths.grown(kept, grows, options)
+    return paths.stretches(kept), paths.stretches(kept & by_rays)
 
 
 @dataclass(frozen=True, slots=True)
@@ -517,13 +509,13 @@ def _sunk_mm(
 def _shares(
     looks: _Looks, planned: _Looks, scan: Scan, evidence: Evidence, template: Template,
     options: SkippedOptions,
-) -> tuple[Values, Values]:  # fmt: skip
-    """(k,) how open each look is by surfaces, in halves of a line, and by rays and surfaces both.
+) -> tuple[Values, Values, Mask]:  # fmt: skip
+    """(k,) how open each look is by surfaces, in halves of a line, by rays and surfaces both.
 
-    Where surfaces say that a line is there and rays that it is open, each ray tells for itself:
-    the nearest planes are those of walls below, as wide as a line, or of the floor below one that
-    hangs, and stand where they should whether the line is there or not. What nobody looked into is
-    there.
+    And whether rays alone say that all of it is. Where surfaces alone do not say that a line is
+    gone and rays say that it is open, each ray tells for itself: the nearest planes are those of
+    walls below, as wide as a line, or of the floor below one that hangs, and stand where they
+    should whether the line is there or not. What nobody looked into is there.
     """
     told_mm = evidence.clearance(looks.middle_mm, template.distance(looks.middle_mm))[0]
     known = told_mm > SOLID_MM + 1e-6
@@ -531,14 +523,15 @@ def _shares(
     surface = np.clip(told_mm / seen.half_mm, -1.0, 1.0)
     rays = np.clip(seen.rays_mm / seen.half_mm, -1.0, options.most_share)
     topped = _topped(seen, evidence, options)
-    asked = np.flatnonzero(~topped & (surface < 0) & (seen.sunk_mm == 0))
+    asked = np.flatnonzero(~topped & (surface < options.gone_share) & (seen.sunk_mm == 0))
     went = _went_through(seen.some(asked), planned, scan, template, options)
     told = asked[np.isfinite(went)]
     surface[told] = rays[told] = went[np.isfinite(went)]
-    by_surface, by_both = np.full((2, len(known)), -1.0)
+    (by_surface, by_both), by_rays = np.full((2, len(known)), -1.0), np.zeros(len(known), bool)
+    by_rays[np.flatnonzero(known)[asked]] = went >= options.sure_by_both
     by_surface[known] = surface
     by_both[known] = np.where(topped, -1.0, 0.5 * (surface + rays))
-    return by_surface, by_both
+    return by_surface, by_both, by_rays
 
 
 def _went_through(
