@@ -29,7 +29,8 @@ class Sought:
     gone
         Lines of the job that are not there; None where there are none, and for excess.
     by_rays
-        Stretches of them of which rays alone say so.
+        Stretches of them of which rays alone say so: the nearest planes are those of what lies
+        below and beside, which stands as designed, and say nothing of the line.
     """
 
     template: Template
@@ -85,20 +86,6 @@ class Sought:
             nearest = self.evidence.surfels.tree.nearest_one(samples_mm[asked])
             allowed_mm[asked] = higher_mm[nearest]
         return allowed_mm
-
-    def in_lines_that_are_gone(self, samples_mm: Points) -> Mask:
-        """(k,) places in lines of the job that are gone."""
-        none = np.zeros(len(samples_mm), bool)
-        return none if self.gone is None else self.gone.holds(samples_mm)
-
-    def in_lines_by_rays(self, samples_mm: Points) -> Mask:
-        """(k,) places in lines of which rays alone say that they are gone.
-
-        The nearest planes are those of what lies below and beside, which stands as designed, and
-        say nothing of the line.
-        """
-        none = np.zeros(len(samples_mm), bool)
-        return none if self.by_rays is None else self.by_rays.holds(samples_mm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

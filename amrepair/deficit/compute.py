@@ -29,7 +29,7 @@ from amrepair.frames import Transform, box_of, boxes_meet, in_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
-from amrepair.regions.skipped import PlannedBeads, skipped_by
+from amrepair.regions.skipped import PlannedBeads, skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -210,7 +210,7 @@ def _evidence_of(
     assert evidence is not None
     if beads is None:
         return evidence, None, None
-    lines, by_rays = skipped_by(beads, scan, evidence, template, options)
+    lines, by_rays = skipped(beads, scan, evidence, template, options)
     if not len(lines.width_mm):
         return evidence, None, None
     labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)

@@ -75,9 +75,11 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
         core |= (deep_mm > limit_mm / 4) & (cautious > limit_mm)
     ask = np.flatnonzero(can_be & ~core & (deep_mm > thin_mm) & (clip < 0))
     core[ask] = sought.nearest_is_labelled(samples[ask])
-    line, maybe = np.zeros_like(core), np.flatnonzero((clip < 0) & ~core)
-    line[maybe] = sought.in_lines_that_are_gone(samples[maybe])
-    core |= line
+    line = np.zeros_like(core)
+    if sought.gone is not None:
+        maybe = np.flatnonzero((clip < 0) & ~core)
+        line[maybe] = sought.gone.holds(samples[maybe])
+        core |= line
     if sought.is_excess:
         # one reflection in mid-air is a plane, too, but none that stands out by its label
         found = np.flatnonzero(core)
@@ -97,9 +99,10 @@ def _shown(
     evidence = sought.evidence
     if not sought.is_excess:
         best, cautious = evidence.clearance(samples_mm, f_mm, most_mm)
-        best, held = best.copy(), np.flatnonzero(best < 0)
-        held = held[sought.in_lines_by_rays(samples_mm[held])]
-        best[held] = np.maximum(best[held], evidence.rays_say(samples_mm[held]))
+        if sought.by_rays is not None:
+            best, held = best.copy(), np.flatnonzero(best < 0)
+            held = held[sought.by_rays.holds(samples_mm[held])]
+            best[held] = np.maximum(best[held], evidence.rays_say(samples_mm[held]))
         return best, cautious
     out_mm = evidence.surface_clearance(samples_mm, f_mm)
     # "nobody knows": for excess the cautious answer is that nothing is there

@@ -92,17 +92,6 @@ def skipped(
     evidence: Evidence,
     template: Template,
     options: SkippedOptions = USUAL_SKIPPED,
-) -> PlannedBeads:
-    """Stretches of beads that are not there: the first of `skipped_by`."""
-    return skipped_by(beads, scan, evidence, template, options)[0]
-
-
-def skipped_by(
-    beads: PlannedBeads,
-    scan: Scan,
-    evidence: Evidence,
-    template: Template,
-    options: SkippedOptions = USUAL_SKIPPED,
 ) -> tuple[PlannedBeads, PlannedBeads]:
     """Stretches of beads that are not there, and those of them of which rays alone say so.
 
@@ -558,10 +547,13 @@ def _sag(
     height. A line over the rim of what is below, as in walls that lean and in cubic infill, spreads
     over it: how low it lies then, lines about that are held alike tell, of which so many are there.
     """
-    held, alike = (each.held(template, options) for each in (looks, planned))
+    held = looks.held(template, options)
     sag = np.where(held == 0, 1.0, 0.0)
-    z_mm, other_mm = (np.round(each.middle_mm[:, 2], 6) for each in (looks, planned))
     rim = (held > 0) & (held < options.held_places)
+    if not rim.any():
+        return sag
+    alike = planned.held(template, options)
+    z_mm, other_mm = (np.round(each.middle_mm[:, 2], 6) for each in (looks, planned))
     for high_mm, held_by in np.unique(np.column_stack([z_mm, held])[rim], axis=0):
         mine = np.flatnonzero((z_mm == high_mm) & (held == held_by))
         others = planned.some((other_mm == high_mm) & (alike == held_by))

@@ -108,43 +108,39 @@ def _off_by_job(
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
     """(s,) how far off what is expected, out or in, the job's own path may put each place."""
-    off_mm = _laid_beyond(site, laid, placed, place_mm, deviation_mm)
-    low = deviation_mm < -0.5 * site.allowance_mm
+    off_mm, least_mm = np.zeros(len(place_mm)), 0.5 * site.allowance_mm
+    low, high = deviation_mm < -least_mm, deviation_mm > least_mm
+    if not (low | high).any():
+        return off_mm
+    normal = placed.rotate(unit_vectors(site.expected.distance_and_gradient(place_mm)[1]))
+    in_build = placed.apply(place_mm)
     if low.any():
-        normal = unit_vectors(site.expected.distance_and_gradient(place_mm)[1])
-        sunk_mm = laid.sunk_mm(placed.apply(place_mm), placed.rotate(normal), deviation_mm, low)
-        off_mm[low] = sunk_mm[low]
+        off_mm[low] = laid.sunk_mm(in_build, normal, deviation_mm, low)[low]
+    if high.any():
+        off_mm[high] = _laid_beyond(site, laid, in_build[high], normal[high], deviation_mm[high])
     return off_mm
 
 
 def _laid_beyond(
     site: Site,
     laid: LaidBeads,
-    placed: Transform,
-    place_mm: Float[np.ndarray, "s 3"],
+    in_build: Float[np.ndarray, "s 3"],
+    normal: Float[np.ndarray, "s 3"],
     deviation_mm: Float[np.ndarray, " s"],
 ) -> Float[np.ndarray, " s"]:
     """(s,) how far out of what is expected the job's own path may put each place.
 
     What is seen on or beside supports, within how far strands stray, is no evidence of the part.
     """
-    beyond_mm = np.zeros(len(place_mm))
-    some = np.flatnonzero(deviation_mm > 0.5 * site.allowance_mm)
-    if len(some):
-        normal = unit_vectors(site.expected.distance_and_gradient(place_mm[some])[1])
-        in_build = placed.apply(place_mm[some])
-        offset_mm, tolerance_mm = laid.expected_offset_mm(
-            in_build, placed.rotate(normal), deviation_mm[some]
-        )
-        least_mm, over_mm = np.zeros(len(some)), site.options.over_beside_mm
-        if site.strands is not None:
-            top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
-            least_mm[in_build[:, 2] < top_mm + over_mm] = site.options.stray_mm
-        if site.beside is not None:
-            beside = in_build[:, 2] < _highest_around(site.beside, in_build, site.options) + over_mm
-            least_mm[beside] = np.maximum(least_mm[beside], deviation_mm[some][beside])
-        beyond_mm[some] = np.maximum(offset_mm + tolerance_mm, least_mm)
-    return beyond_mm
+    offset_mm, tolerance_mm = laid.expected_offset_mm(in_build, normal, deviation_mm)
+    least_mm, over_mm = np.zeros(len(in_build)), site.options.over_beside_mm
+    if site.strands is not None:
+        top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
+        least_mm[in_build[:, 2] < top_mm + over_mm] = site.options.stray_mm
+    if site.beside is not None:
+        beside = in_build[:, 2] < _highest_around(site.beside, in_build, site.options) + over_mm
+        least_mm[beside] = np.maximum(least_mm[beside], deviation_mm[beside])
+    return np.asarray(np.maximum(offset_mm + tolerance_mm, least_mm))
 
 
 def _highest_around(beside: HeightField, in_build: Points, options: RepairOptions) -> Values:

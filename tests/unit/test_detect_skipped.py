@@ -17,6 +17,7 @@ from amrepair.regions.options import USUAL_SKIPPED
 from amrepair.regions.skipped import PlannedBeads, _Paths, _wall_shift, skipped
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf, PlannedSdf
+from amrepair.template.port import Template
 from tests import analytic
 
 SIGMA_MM = 0.03
@@ -61,6 +62,22 @@ def scan_of(solid: m3.Manifold, seed: int) -> Scan:
     return Scan(points, SIGMA_MM, "template", None, SENSORS.copy(), who)
 
 
+def gone_lines(
+    beads: PlannedBeads, scan: Scan, evidence: Evidence, template: Template
+) -> PlannedBeads:
+    return skipped(beads, scan, evidence, template)[0]
+
+
+def scan_aslant(solid: m3.Manifold, seed: int) -> Scan:
+    points, who = analytic.ray_scan(solid, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
+    return Scan(points, 0.05, "template", None, ASLANT.copy(), who)
+
+
+def planned_of(beads: PlannedBeads) -> PlannedSdf:
+    section = beads.width_mm * beads.height_mm
+    return PlannedSdf.from_beads(beads.start_mm, beads.end_mm, section, beads.height_mm)
+
+
 def deficit_of(scan: Scan, beads: PlannedBeads | None) -> Deficit:
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     return compute_deficit(scan, BLOCK, anomaly, build_from_template=HERE, beads=beads)
@@ -86,7 +103,7 @@ def test_lines_that_lie_where_they_should_are_not_skipped(seed: int) -> None:
     scan = scan_of(BLOCK.body, seed)
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
-    assert len(skipped(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
+    assert len(gone_lines(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
 
 
 def shrunk(solid: m3.Manifold, by_mm: float) -> m3.Manifold:
@@ -103,7 +120,7 @@ def test_a_wall_that_stands_farther_in_lacks_no_line(by_mm: float, seed: int) ->
     scan = scan_of(shrunk(BLOCK.body, by_mm), seed)
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
-    assert len(skipped(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
+    assert len(gone_lines(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -111,7 +128,7 @@ def test_a_line_that_is_gone_is_told_where_walls_stand_farther_in(seed: int) -> 
     scan = scan_of(shrunk(without(8.0, 12.0, 0, HIGH_MM), 0.12), seed)
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
-    gone = skipped(lines(), scan, anomaly.evidence, BLOCK)
+    gone = gone_lines(lines(), scan, anomaly.evidence, BLOCK)
     mine = (gone.start_mm[:, 1] == 0.5 * WIDE_MM) & (gone.start_mm[:, 2] == TOP_MM)
     length_mm = gone.end_mm[mine, 0] - gone.start_mm[mine, 0]
     assert length_mm.sum() == pytest.approx(4.0, abs=1.0)
@@ -145,14 +162,14 @@ def test_a_line_with_half_of_its_plastic_is_not_skipped() -> None:
     scan = scan_of(without(2.0, 22.0, 1, 0.5 * HIGH_MM), 0)
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
-    assert len(skipped(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
+    assert len(gone_lines(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
 
 
 def test_the_stretch_that_is_gone_is_told_where_it_is() -> None:
     scan = scan_of(without(8.0, 12.0, 1, 2 * HIGH_MM), 0)
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
-    gone = skipped(lines(), scan, anomaly.evidence, BLOCK)
+    gone = gone_lines(lines(), scan, anomaly.evidence, BLOCK)
     mine = gone.start_mm[:, 1] == 1.5 * WIDE_MM
     assert gone.start_mm[mine, 0].min() == pytest.approx(8.0, abs=0.5)
     assert gone.end_mm[mine, 0].max() == pytest.approx(12.0, abs=0.5)
@@ -172,7 +189,7 @@ def test_a_curve_that_is_gone_is_told_though_it_is_many_short_lines() -> None:
     place = whole.start_mm[:, None] + share[:, None] * (whole.end_mm - whole.start_mm)[:, None]
     wide, high = (np.repeat(each, count) for each in (whole.width_mm, whole.height_mm))
     pieces = PlannedBeads(place[:, :-1].reshape(-1, 3), place[:, 1:].reshape(-1, 3), wide, high)
-    gone, told = (skipped(beads, scan, anomaly.evidence, BLOCK) for beads in (pieces, whole))
+    gone, told = (gone_lines(beads, scan, anomaly.evidence, BLOCK) for beads in (pieces, whole))
     assert len(gone.width_mm) > len(told.width_mm) > 0
     for row in range(3):
         at = (row + 0.5) * WIDE_MM
@@ -199,7 +216,7 @@ def test_a_corner_ends_a_line() -> None:
     y, z = 1.5 * WIDE_MM, TOP_MM
     path = np.array([[8.0, y + 3.0, z], [8.0, y, z], [9.2, y, z], [9.2, y + 3.0, z]])
     beads = PlannedBeads(path[:-1], path[1:], np.full(3, WIDE_MM), np.full(3, HIGH_MM))
-    assert len(skipped(beads, scan, anomaly.evidence, BLOCK).width_mm) == 0
+    assert len(gone_lines(beads, scan, anomaly.evidence, BLOCK).width_mm) == 0
 
 
 def test_without_rays_nothing_is_said_of_lines() -> None:
@@ -209,7 +226,7 @@ def test_without_rays_nothing_is_said_of_lines() -> None:
     scan = Scan(points, SIGMA_MM, "template", normals)
     anomaly = detect(scan, BLOCK)
     assert anomaly.evidence is not None
-    assert len(skipped(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
+    assert len(gone_lines(lines(), scan, anomaly.evidence, BLOCK).width_mm) == 0
 
 
 def test_a_point_is_in_a_line_by_its_section() -> None:
@@ -274,7 +291,7 @@ def test_rays_alone_do_not_tell_of_another_line_nor_of_more_of_the_same(
 def gone_of(scan: Scan) -> PlannedBeads:
     anomaly = detect(scan, BLOCK, top_z_mm=TOP_MM)
     assert anomaly.evidence is not None
-    return skipped(lines(), scan, anomaly.evidence, BLOCK)
+    return gone_lines(lines(), scan, anomaly.evidence, BLOCK)
 
 
 @pytest.mark.parametrize("open_again", [False, True])
@@ -385,7 +402,7 @@ def test_strands_over_a_shallow_pocket_are_there_though_its_floor_is_seen_betwee
     scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
     anomaly = detect(scan, template, top_z_mm=HANGS_MM)
     assert anomaly.evidence is not None
-    found = skipped(beads, scan, anomaly.evidence, template)
+    found = gone_lines(beads, scan, anomaly.evidence, template)
     told_mm = np.linalg.norm(found.end_mm - found.start_mm, axis=1)
     right = np.abs(found.start_mm[:, 1] - beads.start_mm[4, 1]) < 1e-6
     assert told_mm[right].sum() == pytest.approx(21.6 * len(gone), rel=0.2)
@@ -415,11 +432,10 @@ def test_a_layer_over_strands_lies_lower_and_lacks_what_is_gone_only(
         bar = m3.Manifold.cube((24.0 - 2 * RIM_MM, WIDE_MM, 1.0))
         low_mm = HANGS_MM - lower_mm
         sunk -= bar.translate((RIM_MM, beads.start_mm[row, 1] - WIDE_MM / 2, low_mm))
-    points, who = analytic.ray_scan(sunk, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
-    scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
+    scan = scan_aslant(sunk, seed)
     anomaly = detect(scan, template, top_z_mm=top_mm)
     assert anomaly.evidence is not None
-    found = skipped(lines, scan, anomaly.evidence, template)
+    found = gone_lines(lines, scan, anomaly.evidence, template)
     told_mm = np.linalg.norm(found.end_mm - found.start_mm, axis=1)
     right = np.isin(found.start_mm[:, 1], beads.start_mm[list(gone), 1])
     assert told_mm[right].sum() == pytest.approx(21.6 * len(gone), rel=0.2)
@@ -454,7 +470,7 @@ def test_a_line_of_a_wall_that_leans_lies_no_lower_for_it(
     scan = scan_of(solid, seed)
     evidence = detect(scan, template, top_z_mm=TOP_MM).evidence
     assert evidence is not None
-    found = skipped(beads, scan, evidence, template)
+    found = gone_lines(beads, scan, evidence, template)
     told_mm = [
         (found.end_mm - found.start_mm)[(found.start_mm[:, 1:] == start[1:]).all(axis=1), 0].sum()
         for start in beads.start_mm
@@ -492,10 +508,7 @@ def test_a_line_on_a_wall_as_thin_as_itself_is_missed_whole(
     # of lines of open infill that were gone half were not told, and of those told a third of the
     # plastic
     solid, beads = cells(gone_mm)
-    section = beads.width_mm * beads.height_mm
-    template = PlannedSdf.from_beads(beads.start_mm, beads.end_mm, section, beads.height_mm)
-    points, who = analytic.ray_scan(solid, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
-    scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
+    scan, template = scan_aslant(solid, seed), planned_of(beads)
     anomaly = detect(scan, template, top_z_mm=CELLS_MM)
     found = compute_deficit(scan, template, anomaly, build_from_template=HERE, beads=beads)
     true_mm3 = (gone_mm[1] - gone_mm[0]) * WIDE_MM * HIGH_MM
@@ -532,13 +545,10 @@ def test_lines_over_a_rim_are_as_low_as_those_like_them(
     # rim of the one below, and with rays telling for lines that rest 2.9 mm³ of a clean plate were
     # missing
     solid, beads = ramps(SAGS_MM, gone_mm)
-    section = beads.width_mm * beads.height_mm
-    template = PlannedSdf.from_beads(beads.start_mm, beads.end_mm, section, beads.height_mm)
-    points, who = analytic.ray_scan(solid, ASLANT, spacing_mm=0.3, sigma_mm=0.05, seed=seed)
-    scan = Scan(points, 0.05, "template", None, ASLANT.copy(), who)
+    scan, template = scan_aslant(solid, seed), planned_of(beads)
     top_mm = float(beads.start_mm[:, 2].max())
     evidence = detect(scan, template, top_z_mm=top_mm).evidence
     assert evidence is not None
-    found = skipped(beads, scan, evidence, template)
+    found = gone_lines(beads, scan, evidence, template)
     told_mm = float(np.linalg.norm(found.end_mm - found.start_mm, axis=1).sum())
     assert told_mm == pytest.approx(gone_mm[1] - gone_mm[0], abs=1.0)
