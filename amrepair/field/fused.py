@@ -105,6 +105,12 @@ class Surfels:
         place[which] += moved_mm[:, None] * normal
         return replace(self, place_mm=place)
 
+    def wide_mean(self, value: Values) -> Values:
+        """(s,) the mean of a value of the cells over each of them and its 26 neighbours."""
+        sums = np.stack([self.count * value, self.count], axis=1)
+        wide = kernels.neighbour_sums(self.table, np.ascontiguousarray(sums, dtype=np.float64))
+        return np.asarray(wide[:, 0] / wide[:, 1])
+
     def by_view(self, view_index: Int[np.ndarray, " m"]) -> Shares:
         """What each view says of each cell that it saw, the cells rising."""
         views = int(view_index.max(initial=0)) + 1

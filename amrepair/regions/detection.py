@@ -142,7 +142,7 @@ def _tested(
     # to be normal is there any
     strands = np.zeros(len(seen.surfels), bool)
     if calibration == NORMAL_NOISE:
-        strands = _strands(seen, levels, options)
+        strands = _strands(seen, sites, levels, options)
     tolerances_mm = tolerances(options, seen.template)
     labels, log_p = grown(
         levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
@@ -194,19 +194,27 @@ def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
     return tested(anomaly.sites, anomaly.options, None)
 
 
-def _strands(seen: Observed, levels: tuple[Level, ...], options: RegionOptions) -> Mask:
-    """(n,) cells of strips narrower than any window that stand out along their length."""
+def _strands(
+    seen: Observed, sites: Sites, levels: tuple[Level, ...], options: RegionOptions
+) -> Mask:
+    """(n,) cells of strips narrower than any window that stand out along their length.
+
+    By how much more than each cell may: what the job itself lays, as supports, stands out too.
+    """
     surfels = seen.surfels
     first = levels[1]
-    at = first.scale.of_base[: len(surfels)]
-    low_mm = options.grow_share * first.tolerance_mm[1]
+    cells = slice(len(surfels))
+    usual_mm = float(np.median(first.tolerance_mm[1]))
+    higher_mm = sites.value_mm[cells] - sites.tolerance_mm[1, cells] + usual_mm
     per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
     # of what is as narrow as a few cells, errors have a tail as long as that of those cells
     critical = float(max(first.critical[1], levels[0].critical[1]))
     return on_strands(
         surfels,
         seen.template,
-        surfels.wide_deviation_mm > low_mm[at],  # a mean: a median tells nothing of a strip
+        higher_mm,
+        # a mean: a median tells nothing of a strip
+        surfels.wide_mean(higher_mm) > options.grow_share * usual_mm,
         systematic_mm=float(np.median(first.tolerance_mm[1] + critical * first.errors.common_mm)),
         noise_mm=critical * per_point_mm,
     )

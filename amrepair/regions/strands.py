@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from amrepair.arrays import Mask
+from amrepair.arrays import Mask, Values
 from amrepair.field.fused import Surfels
 from amrepair.field.near import cells_about
 from amrepair.frames import unit_vectors, ways_across
@@ -26,12 +26,20 @@ SEEN = 0.5
 
 
 def on_strands(
-    surfels: Surfels, template: Template, maybe: Mask, *, systematic_mm: float, noise_mm: float
+    surfels: Surfels,
+    template: Template,
+    higher_mm: Values,
+    maybe: Mask,
+    *,
+    systematic_mm: float,
+    noise_mm: float,
 ) -> Mask:
     """(n,) cells that lie on a strip whose mean deviation outwards is over its limit.
 
     Parameters
     ----------
+    higher_mm
+        (n,) how far outside each cell lies, without what is usual there.
     maybe
         Cells that such a strip may pass through.
     systematic_mm, noise_mm
@@ -50,6 +58,6 @@ def on_strands(
     return kernels.on_strips(
         asked_mm, (outward, *ways_across(outward)),
         np.stack([np.cos(turn), np.sin(turn)], axis=1), cells,
-        surfels.count, surfels.deviation_mm, maybe, (LONG_MM, WIDE_MM, TALL_MM),
+        surfels.count, higher_mm, maybe, (LONG_MM, WIDE_MM, TALL_MM),
         (enough, systematic_mm, noise_mm, LEAST_RIDGE_MM),
     )  # fmt: skip

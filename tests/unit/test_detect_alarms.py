@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from amrepair.arrays import Points, Values
 from amrepair.regions import Label, detect
 from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
@@ -126,6 +127,18 @@ def test_a_strand_is_told_at_twice_the_noise(seed: int) -> None:
     middle = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))
     assert np.abs(middle[:2] - (12, 10)).max() < 1.5
     assert np.linalg.norm(np.ptp(boxes.reshape(-1, 3), axis=0)[:2]) > 8.0
+
+
+def test_a_strand_that_the_job_lays_is_nothing_too_much() -> None:
+    # regression: narrow parts of what a support leaves beside a part were told as strands, though
+    # nothing that is seen on a support is evidence of the part
+    plate, lies = box((0, 0, 0), (24, 20, 3)), strand(0.02, 0.5, 0)
+
+    def as_laid(place_mm: Points, deviation_mm: Values) -> Values:
+        return np.maximum(deviation_mm, 0.0)
+
+    assert detect(lies, plate, calibration=NORMAL_NOISE).regions != ()
+    assert detect(lies, plate, calibration=NORMAL_NOISE, off_by_job=as_laid).regions == ()
 
 
 @pytest.mark.parametrize(("gone_mm", "floor_mm"), [(0.3, 10.0), (5.0, 10.0), (5.0, 3.0)])
