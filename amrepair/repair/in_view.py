@@ -116,8 +116,20 @@ def _off_by_job(
     in_build = placed.apply(place_mm)
     if low.any():
         off_mm[low] = laid.sunk_mm(in_build, normal, deviation_mm, low)[low]
+        off_mm[low] = np.maximum(off_mm[low], _strays(site, place_mm[low], in_build[low]))
     if high.any():
         off_mm[high] = _laid_beyond(site, laid, in_build[high], normal[high], deviation_mm[high])
+    return off_mm
+
+
+def _strays(site: Site, place_mm: Points, in_build: Points) -> Values:
+    """(s,) how far in strands of supports may lie of where they were planned; none of the part."""
+    off_mm = np.zeros(len(place_mm))
+    if site.strands is not None:
+        top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
+        near = np.flatnonzero(in_build[:, 2] < top_mm + site.options.over_beside_mm)
+        off = site.template.distance(place_mm[near]) >= site.options.off_the_part_mm
+        off_mm[near[off]] = site.options.stray_mm
     return off_mm
 
 

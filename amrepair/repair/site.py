@@ -112,7 +112,7 @@ class Site:
         does not have them; −inf where nothing does. They are none of the part, nor too much.
     strands
         How high supports stand that are planned, too, and strands may stray, build frame: they are
-        judged, but by as much as they may stray nothing there is too much.
+        judged, but by as much as they may stray nothing there is too much or missing.
     raft
         What a job lays under the part; None where it stands on the bed.
     finished

@@ -131,6 +131,22 @@ def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
     assert (beyond(of_part, np.array([0.3])) < 0.3).all()
 
 
+def test_a_support_s_strands_sag_and_the_part_s_beside_them_do_not() -> None:
+    """regression: the first tops of a support over its pillars were filled up (1 to 3 mm³)."""
+    job = supported()
+    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
+    site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
+    off = in_view.off_by_job(site, here)
+    assert off is not None
+    support = job.beads.role == len(job.beads.roles) - 1
+    tops = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support]
+    of_part = np.array([[x, y, job.layers[10].z_mm] for x in (95.0, 109.7) for y in (94.0, 100.0)])
+    places = np.concatenate([tops, of_part])
+    allowed = off(places, np.full(len(places), -0.3))
+    assert (allowed[: len(tops)] == site.options.stray_mm).all()
+    assert not allowed[len(tops) :].any()
+
+
 WALL = m3.Manifold.cube((1.0, 7.0, 5.0)).translate((110.6, 90.0, 0.0))
 BLOBS = {
     "away from it": m3.Manifold.sphere(2.3, 64).translate((98.0, 90.0, 3.0)),
