@@ -68,11 +68,16 @@ OPEN_LAYERS = 1.5  # a void is under the strand if its roof is no more than this
 
 
 class Bead(NamedTuple):
-    """What a step lays: number of its layer, thickness / mm, how deep below it fills / mm."""
+    """What a step lays: number of its layer, thickness, how deep below it fills, mm.
+
+    `hangs`: how thick it is where nothing is that near below. A bridge's strand has more plastic
+    than its layer has room for, and nothing keeps that from hanging lower.
+    """
 
     layer: Any
     thickness: Any
     gap_limit: Any
+    hangs: Any
 
 
 class Room(NamedTuple):
@@ -121,7 +126,7 @@ def floor_under(
     surface = surface_under(hi, lo, nxt, pool, pool_next, iy, ix, z)
     underside = z - bead.thickness
     if z - surface > bead.gap_limit + LEAST_COLUMN_MM:
-        surface = underside
+        surface = z - bead.hangs
     elif underside - surface > LEAST_VOID_MM:
         across = groove_columns(
             hi, before, stamp, bead.layer, iy, ix, underside - LEAST_VOID_MM, bridges
@@ -469,7 +474,7 @@ def deposit(world, head, path, window, state):
                 axis[4] = np.inf
             axis[0] = (state[LAST_X] - grid[0]) / cell
             axis[1] = (state[LAST_Y] - grid[1]) / cell
-            bead = Bead(int(state[LAYER]), state[LAST_T], state[LAST_GAP])
+            bead = Bead(int(state[LAYER]), state[LAST_T], state[LAST_GAP], state[LAST_T])
             lay(
                 world, head, bead, room, state, state[LAST_X], state[LAST_Y], state[LAST_Z], 0.0,
                 True,
@@ -479,10 +484,9 @@ def deposit(world, head, path, window, state):
         if volume[s] > 0.0:
             half = 0.5 * volume[s] / max(length * thickness[s], LEAST_COLUMN_MM)
             half = max(half, least_half)
-            state[FREE_SPREAD] = half / cell + FREE_COLUMNS
+            free = volume[s] / max(length, LEAST_COLUMN_MM) / head.beside  # as wide as the bore
             flat = max(np.sqrt(dx * dx + dy * dy), LEAST_COLUMN_MM)
             axis[2], axis[3] = -dy / flat, dx / flat
-            axis[4] = half / cell if flat > LEAST_COLUMN_MM else np.inf
             steps = max(1, int(np.ceil(length / head.step_mm)))
             share = volume[s] / steps
             seed = np.abs(np.sin(12.9898 * start[s, 0] + 78.233 * start[s, 1]) * 43758.5453)
@@ -510,7 +514,14 @@ def deposit(world, head, path, window, state):
                         Stacks(hi, lo, nxt, pool, pool_next, meta), before, stamp
                     )
                 laid_z, gap = height_of_strand(world, head, path, state, s, k, x, y, z)
-                bead = Bead(int(state[LAYER]), thickness[s], gap)
+                hangs, wide = thickness[s], half
+                if free > thickness[s]:
+                    below = highest_below(world, head, int(state[LAYER]), x, y, laid_z)
+                    if laid_z - below > gap:
+                        hangs, wide = free, 0.5 * head.beside
+                axis[4] = wide / cell if flat > LEAST_COLUMN_MM else np.inf
+                state[FREE_SPREAD] = wide / cell + FREE_COLUMNS
+                bead = Bead(int(state[LAYER]), thickness[s], gap, hangs)
                 lay(
                     world, head, bead, room, state, x + (jx - 0.5) * cell, y + (jy - 0.5) * cell,
                     laid_z, amount / area, amount <= 0.0,

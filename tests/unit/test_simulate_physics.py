@@ -180,6 +180,32 @@ def test_strand_beside_its_neighbour_hangs_on_it() -> None:
     ] == pytest.approx(4.0, abs=0.01)
 
 
+def test_a_bridge_s_thick_strands_hang_and_push_nothing_aside() -> None:
+    # regression: as thick as their layer they had no room beside one another, and where a slicer
+    # bridges in every layer, as under a slope, walls were pushed out by 0.6 mm: blobs of clean jobs
+    world, nozzle, bore_mm, section_mm2 = World((60.0, 60.0)), Nozzle(), 0.4, 0.1414
+    world.add(m3.Manifold.cube((40, 1, 6.0)).translate((10, 26.8, 0)))  # ends at y = 27.8
+    for x0 in (10, 45):
+        world.add(m3.Manifold.cube((5, 10, 5.8)).translate((x0, 26.8, 0)))
+    nozzle.go(11, 40, 5.8)
+    nozzle.go(12, 40, 5.8, SECTION_MM2)  # that there are layers of 0.2 mm
+    lines_y = 28.0 + 0.45 * np.arange(12)
+    for y in lines_y:
+        nozzle.go(11, y, 7.0)
+        nozzle.go(11, y, 6.0)
+        nozzle.go(49, y, 6.0, section_mm2)
+    nozzle.go(49, 40, 9.0)
+    before_mm3 = world.volume_mm3
+    motion = nozzle.batch()
+    world.deposit(motion)
+    assert world.volume_mm3 - before_mm3 == pytest.approx(commanded_mm3(motion), rel=1e-9)
+    hang = world.snapshot(world.columns.box_window((20.0, 27.8), (40.0, 36.0)))
+    low, high = hang.bounds_mm()
+    assert high[1] < lines_y[-1] + 0.5 * bore_mm + 2 * world.cell_mm
+    assert high[2] < 6.0 + 0.02
+    assert low[2] == pytest.approx(6.0 - section_mm2 / bore_mm, abs=0.05)
+
+
 def test_groove_is_spanned_and_a_trench_is_filled() -> None:
     for wide_mm, y0, is_spanned in (
         (0.125, 30.0, True),
