@@ -17,6 +17,7 @@ from scipy import ndimage
 from amrepair.align import align
 from amrepair.arrays import Box, Mask, Numbers, PlanePoints, Points, Values
 from amrepair.errors import AlignmentError
+from amrepair.field.groups import cell_numbers
 from amrepair.frames import Transform, box_of, rotation_from_vector
 from amrepair.loop.outlines import outermost
 from amrepair.scans import Scan
@@ -51,6 +52,7 @@ MOVED_MM, MOST_MOVES = 0.04, 5
 # What users and makers of filaments tell slicers: hundredths of a millimetre, tenths of a per cent.
 USUAL_MOVE_MM, USUAL_STRETCH = 0.1, 0.005
 WALLS_TELL_RATIO = 0.3  # how exactly all walls together tell it, of a usual move
+EVEN_MM = 4.0  # a slicer moves a fuzzy skin's points, 0.8 mm apart, each as it likes
 MOST_STRETCH = 0.02  # polypropylene's; more is another scale
 # Of its height, a bead is wider by so much than a rectangle: half of what round sides make, since
 # some slicers reckon with those and some without.
@@ -305,8 +307,17 @@ class _Walls:
             self,
             outside_mm=self.outside_mm + USUAL_MOVE_MM * share[0],
             stretch=self.stretch + USUAL_STRETCH * share[1],
-            off_mm=float(np.median(np.abs(off_mm - told @ share))),
+            off_mm=_off_together_mm(off_mm - told @ share, points, gradient),
         )
+
+
+def _off_together_mm(off_mm: Values, points_mm: Points, outward: Points) -> float:
+    """How far walls lie off, the median of what neighbours of a side do: a fuzzy skin is even."""
+    cells = np.floor(points_mm / EVEN_MM).astype(np.int64)
+    side = (outward[:, :2] > 0.0).astype(np.int64)
+    patch = cell_numbers(np.column_stack([cells, side]))
+    together_mm = np.bincount(patch, off_mm) / np.bincount(patch)
+    return float(np.median(np.abs(together_mm[patch])))
 
 
 def _as_moved(laid: Scan, inset: _Inset, placed: Transform) -> tuple[Transform, _Walls]:

@@ -360,6 +360,36 @@ def test_a_job_that_is_stretched_for_what_shrinks_is_the_part_s(stretch: float) 
     assert off_mm_of(placed, (90.0, 80.0, 0.0), part) < 0.15
 
 
+def roughened(job: Job, off_mm: float, seed: int) -> Job:
+    """The same job with a fuzzy skin: every 0.8 mm its walls are aside by up to so much."""
+    beads, rng = job.beads, np.random.default_rng(seed)
+    way = beads.end_mm - beads.start_mm
+    length_mm = np.linalg.norm(way, axis=1)
+    pieces = np.ceil(length_mm / 0.8).astype(np.int64)
+    owner = np.repeat(np.arange(len(beads)), pieces)
+    k = np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    across = np.column_stack([-way[:, 1], way[:, 0]]) / np.maximum(length_mm, 1e-9)[:, None]
+    ends = [
+        beads.start_mm[owner] + (way / pieces[:, None])[owner] * (k + d)[:, None] for d in (0, 1)
+    ]
+    aside = rng.uniform(-off_mm, off_mm, len(owner) + 1)
+    for end, by_mm in zip(ends, (aside[:-1], aside[1:]), strict=True):
+        end[:, :2] += by_mm[:, None] * across[owner]
+    told = {
+        name: getattr(beads, name)[owner]
+        for name in ("section_mm2", "width_mm", "height_mm", "role", "layer", "line")
+    }
+    return replace(job, beads=replace(beads, start_mm=ends[0], end_mm=ends[1], **told))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_job_with_a_fuzzy_skin_is_the_part_s(seed: int) -> None:
+    """regression: seven of eight figures with PrusaSlicer's fuzzy skin were other parts."""
+    job = roughened(job_of(wedge().translate((100.0, 90.0, 0.0))), 0.3, seed)
+    placed = locate_part(job, MeshSdf.from_mesh(solid_mesh(wedge())), layer_height_mm=LAYER_MM)
+    assert off_mm_of(placed, (100.0, 90.0, 0.0), wedge()) < 0.1
+
+
 @pytest.mark.parametrize("stretch", [0.04])
 def test_a_job_at_another_scale_is_another_part_s(stretch: float) -> None:
     part = m3.Manifold.cube((50.0, 20.0, 2.0)) + m3.Manifold.cube((10.0, 35.0, 2.0))
