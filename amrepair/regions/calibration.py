@@ -32,25 +32,32 @@ class Tail:
         How many such peaks a scan has.
     told_by
         How many peaks told the scale: the fewer, the less sure it is.
+    longest
+        They fall to 1/e over so many standard errors at most, however few told the scale.
     """
 
     start: float
     scale: float
     peaks: float
     told_by: float
+    longest: float = np.inf
 
     def log_expected(self, z: Values) -> Values:
         """(s,) logarithm of how many peaks of sound places a scan has beyond each value.
 
         An exponential whose mean is itself told by `told_by` peaks predicts a Lomax tail.
         """
-        beyond = np.maximum(z - self.start, 0.0) / (self.told_by * self.scale)
-        return np.asarray(np.log(max(self.peaks, 1.0)) - self.told_by * np.log1p(beyond))
+        beyond = np.maximum(z - self.start, 0.0)
+        falls = np.maximum(
+            self.told_by * np.log1p(beyond / (self.told_by * self.scale)), beyond / self.longest
+        )
+        return np.asarray(np.log(max(self.peaks, 1.0)) - falls)
 
     def exceeded_by(self, expected: float) -> float:
         """Beyond which value a scan has so many peaks of sound places."""
         ratio = max(self.peaks, 1.0) / expected
-        return self.start + self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
+        told = self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
+        return self.start + min(told, self.longest * float(np.log(ratio)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -387,16 +387,24 @@ def _peaks(scale: Scale, z: Values, start: float) -> Float[np.ndarray, " p"]:
 def _tail(peaks: Values, options: RegionOptions) -> Tail:
     """The exponential tail of the peaks over the tolerance that belong together.
 
-    The lower half of the peaks is taken for errors; from there upwards each is, too, for as long
+    What so many peaks with the longest tail do not reach is no error, and tells nothing of them.
+    The lower half of the rest is taken for errors; from there upwards each is, too, for as long
     as it is no outlier of the exponential that those before it tell (a forward search, as in
     Kimber 1982). The first outlier and all above it may be real.
     """
+    start, longest = options.tail_from, options.longest_tail
+
+    def reach(count: int) -> float:
+        return start + longest * float(np.log(max(count, 1) / options.false_regions))
+
+    while len(peaks) and peaks[-1] > reach(len(peaks)):
+        peaks = peaks[:-1]
     if len(peaks) < 2 * RANK:  # the lower half is too few to tell a tail from
-        return Tail(options.tail_from, 0.0, *2 * (float(len(peaks)),))
-    beyond = peaks - options.tail_from
+        return Tail(start, 0.0, *2 * (float(len(peaks)),))
+    beyond = peaks - start
     for sound in range(len(beyond) // 2, len(beyond) + 1):
-        scale = min(float(beyond[:sound].mean()), options.longest_tail)
-        tail = Tail(options.tail_from, scale, float(sound), float(sound))
+        scale = min(float(beyond[:sound].mean()), longest)
+        tail = Tail(start, scale, float(sound), float(sound), longest)
         if sound < len(beyond) and peaks[sound] > tail.exceeded_by(options.false_regions):
             break
     return tail

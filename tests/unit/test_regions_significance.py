@@ -21,7 +21,15 @@ from amrepair.regions.detection import judged_levels
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import as_normal, as_student
 from amrepair.scans import Scan
-from tests.analytic import AnalyticTemplate, cylinder, noisy_scan_points, sample_surface, sphere
+from tests.analytic import (
+    AnalyticTemplate,
+    box,
+    cylinder,
+    noisy_scan_points,
+    sample_surface,
+    sphere,
+    union,
+)
 
 BALL_MM, SPACING_MM = 30.0, 0.6
 
@@ -140,6 +148,25 @@ def test_a_small_scan_tells_its_wander_less_surely_than_a_large_one(ball: Analyt
     assert usual[0] > 5.0
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_defect_of_many_pieces_is_not_taken_for_errors_of_the_scan(seed: int) -> None:
+    """A comb's six teeth are worn together: on tops and flanks they show in a dozen places."""
+    part = box((0.0, 0.0, 0.0), (50.0, 24.0, 7.0))
+    teeth = [(2.0 + 5.0 * k, 5.0 + 5.0 * k) for k in range(6)]
+    for low_mm, high_mm in teeth:
+        part = union(part, box((low_mm, 4.0, 6.5), (high_mm, 10.0, 15.0)))
+    tool = box((-5.0, -10.0, 0.0), (55.0, 50.0, 20.0)).body.rotate((12.0, 0.0, 0.0))
+    worn = part.body - tool.translate((0.0, 0.0, 13.0))
+    points, _ = noisy_scan_points(worn, spacing_mm=0.2, sigma_mm=0.04, seed=seed)
+    found = detect(Scan(points, 0.04, "template"), part).regions
+    assert {region.label for region in found} == {Label.MISSING}
+    for low_mm, high_mm in teeth:
+        middle_mm = (0.5 * (low_mm + high_mm), 8.0, 14.9)
+        assert any(
+            bool(((middle_mm > r.box_mm[0]) & (middle_mm < r.box_mm[1] + 0.2)).all()) for r in found
+        )
+
+
 def test_few_peaks_tell_a_tail_less_surely_than_many() -> None:
     """By hand: of one peak in a scan, Lomax's tail falls to 0.05 at m k (20^(1/k) − 1)."""
     few, many = (Tail(1.0, 0.5, 1.0, told_by) for told_by in (6.0, 1e6))
@@ -174,8 +201,6 @@ def test_windows_are_what_a_plain_loop_makes_of_them() -> None:
 
 
 def test_scales_do_not_mix_the_sides_of_a_thin_wall() -> None:
-    from tests.analytic import box
-
     wall = box((0, 0, 0), (20, 1.0, 20))
     place, normal = sample_surface(wall.body, 0.4, seed=2)
     value = np.where(place[:, 1] > 0.5, -0.3, 0.0)
