@@ -63,10 +63,15 @@ UPRIGHT = math.cos(math.radians(0.5))  # walls of a low part tell its tilt to a 
 
 @dataclass(frozen=True, slots=True)
 class _Inset:
-    """A template shrunk by `depth_mm` (`Template`, as far as an alignment asks it)."""
+    """A template shrunk by `depth_mm` (`Template`, as far as an alignment asks it).
+
+    Where it is known which way is `up`, along its layers, as slicers lay walls: of a slope that is
+    less across it, by its sine, and of a top nothing.
+    """
 
     whole: Template
     depth_mm: float
+    up: Float[np.ndarray, " 3"] | None = None
 
     @property
     def bounds_mm(self) -> Box:
@@ -77,11 +82,19 @@ class _Inset:
         return self.whole.bias_mm
 
     def distance(self, points_mm: Points) -> Values:
+        if self.up is not None:
+            return self.distance_and_gradient(points_mm)[0]
         return self.whole.distance(points_mm) + self.depth_mm
 
     def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         distance, gradient = self.whole.distance_and_gradient(points_mm)
-        return distance + self.depth_mm, gradient
+        return distance + self.depth_mm * self.level(gradient), gradient
+
+    def level(self, gradient: Points) -> Values:
+        """(n,) how much of a move along a layer is across each surface."""
+        if self.up is None:
+            return np.ones(len(gradient))
+        return np.sqrt(np.maximum(1.0 - (gradient @ self.up) ** 2, 0.0))
 
     def surface_points(
         self, spacing_mm: float
@@ -287,19 +300,24 @@ class _Walls:
         points[:, :2] = middle + (points[:, :2] - middle) / (1.0 + self.stretch)
         return replace(self.laid, points_mm=points)
 
+    def moved(self, inset: _Inset, placed: Transform) -> _Inset:
+        """Where they are expected, the part being placed so."""
+        up = placed.inverse().rotation[:, 2]
+        return replace(inset, depth_mm=inset.depth_mm - self.outside_mm, up=up)
+
     def told_off(self, inset: _Inset, placed: Transform) -> _Walls:
         """What else has moved them, where the part is placed so, is added to what is known.
 
         Of walls all around, what a wrong place moves cancels out.
         """
         points = placed.inverse().apply(self.unstretched.points_mm)
-        moved = replace(inset, depth_mm=inset.depth_mm - self.outside_mm)
+        moved = self.moved(inset, placed)
         off_mm, gradient = moved.distance_and_gradient(points)
         far_mm = np.einsum(
             "ij,ij->i", (points - box_of(points).mean(axis=0))[:, :2], gradient[:, :2]
         )
         near_mm = np.clip(off_mm, -inset.depth_mm, inset.depth_mm)
-        told = np.column_stack([np.full(len(far_mm), USUAL_MOVE_MM), USUAL_STRETCH * far_mm])
+        told = np.column_stack([USUAL_MOVE_MM * moved.level(gradient), USUAL_STRETCH * far_mm])
         # as points along a wall are off together, they tell no more than a few of them would
         prior = np.eye(2) * len(told) * (WALLS_TELL_RATIO * USUAL_MOVE_MM) ** 2
         share = np.linalg.solve(told.T @ told + prior, told.T @ near_mm)
@@ -330,8 +348,7 @@ def _as_moved(laid: Scan, inset: _Inset, placed: Transform) -> tuple[Transform, 
         walls = more
         if change_mm < MOVED_MM:
             break
-        moved = replace(inset, depth_mm=inset.depth_mm - walls.outside_mm)
-        found = align(walls.unstretched, moved, guess=placed.inverse())
+        found = align(walls.unstretched, walls.moved(inset, placed), guess=placed.inverse())
         placed = found.template_from_scan.inverse()
     return placed, walls
 

@@ -347,6 +347,23 @@ def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
     assert (final.planned is not None) == (moved_mm != 0.0)
 
 
+@pytest.mark.parametrize("moved_mm", [0.0, -0.1])
+def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) -> None:
+    """regression: a dome's were told moved by 0.1 mm, and its flanks not looked at in the end."""
+    foot = m3.CrossSection.circle(13.4, 96)
+    part = foot.extrude(1.5) + foot.extrude(7.0, scale_top=(0.3, 0.3)).translate((0.0, 0.0, 1.4))
+    less = foot.offset(moved_mm)
+    laid = less.extrude(1.5) + less.extrude(
+        7.0, scale_top=((4.02 + moved_mm) / (13.4 + moved_mm),) * 2
+    ).translate((0.0, 0.0, 1.4))
+    job = job_of(laid.translate((100.0, 90.0, 0.0)))
+    template = MeshSdf.from_mesh(solid_mesh(part))
+    placed = locate_part(job, template, layer_height_mm=LAYER_MM)
+    assert walls_moved_mm(job, template, placed) == pytest.approx(abs(moved_mm), abs=0.035)
+    final = sites(job, template, placed, SETUP)(plan_stops(job, [])[-1])
+    assert (final.planned is not None) == (moved_mm != 0.0)
+
+
 @pytest.mark.parametrize("stretch", [-0.01, 0.015])
 def test_a_job_that_is_stretched_for_what_shrinks_is_the_part_s(stretch: float) -> None:
     """regression: 0.5 % of a part of 60 mm made it another part, or laid it aside by as much."""
