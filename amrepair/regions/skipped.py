@@ -172,7 +172,9 @@ class _Paths:
         along = np.einsum("ij,ij->i", over[1:], over[:-1])
         begins[1:] = ~joined | (along < options.straight_on * length_mm[1:] * length_mm[:-1])
         path = np.cumsum(begins) - 1
-        keep = np.bincount(path, length_mm)[path] >= options.least_stretch_mm
+        # nothing begins in a shorter path, but what is gone goes on round its corners
+        chain = np.concatenate([[0], np.cumsum(~joined)])[: len(length_mm)]
+        keep = np.bincount(chain, length_mm)[chain] >= options.least_stretch_mm
         lines, length_mm = beads.some(keep), length_mm[keep]
         path = np.unique(path[keep], return_inverse=True)[1]
         ends_mm = np.concatenate([[0.0], np.cumsum(length_mm)])

@@ -319,6 +319,28 @@ def test_a_stretch_goes_on_round_a_corner_as_long_as_looks_say_open(open_again: 
     assert found.start_mm[1] == pytest.approx([10.0, 0.0, 1.0], abs=1e-6)
 
 
+def test_a_stretch_goes_on_through_what_is_too_short_to_begin_one() -> None:
+    # regression: of a void in a Hilbert curve of infill the turns, 1.1 mm long, were never asked
+    # for, and up to a tenth of its lines stayed open at the void's rim
+    turns = np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 1.1], [6.1, 1.1], [6.1, 0.0]])
+    corners = np.column_stack([turns, np.ones(len(turns))])
+    alone = np.array([[9.0, 0.0, 1.0], [10.1, 0.0, 1.0]])
+    start, end = (
+        np.vstack([corners[a:b], alone[k : k + 1]]) for k, a, b in ((0, 0, -1), (1, 1, 5))
+    )
+    paths = _Paths.of(
+        PlannedBeads(start, end, np.full(5, WIDE_MM), np.full(5, HIGH_MM)), USUAL_SKIPPED
+    )
+    assert len(paths.lines.width_mm) == 4  # the one alone is too short
+    gone = np.where(paths.at_mm > 2.0, 0.2, -1.0)
+    least_mm = np.full(len(paths.at_mm), USUAL_SKIPPED.least_stretch_mm)
+    kept = paths.kept(gone > 0, gone > 0, least_mm)
+    assert kept.any()
+    assert (paths.at_mm[kept] < 5.0).all()
+    grown = paths.grown(kept, gone, USUAL_SKIPPED)
+    assert grown[paths.at_mm > 2.0].all()
+
+
 FLOOR_MM, RIM_MM, HANGS_MM = 3.0, 1.2, 3.4
 
 
