@@ -124,13 +124,19 @@ def _off_by_job(
 
 def _strays(site: Site, place_mm: Points, in_build: Points) -> Values:
     """(s,) how far in strands of supports may lie of where they were planned; none of the part."""
-    off_mm = np.zeros(len(place_mm))
-    if site.strands is not None:
-        top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
-        near = np.flatnonzero(in_build[:, 2] < top_mm + site.options.over_beside_mm)
+    off_mm, near = np.zeros(len(place_mm)), np.flatnonzero(_by_supports(site, in_build))
+    if len(near):
         off = site.template.distance(place_mm[near]) >= site.options.off_the_part_mm
         off_mm[near[off]] = site.options.stray_mm
     return off_mm
+
+
+def _by_supports(site: Site, in_build: Points) -> Mask:
+    """(s,) which places lie no higher than supports that are planned, too, and strands of them."""
+    if site.strands is None:
+        return np.zeros(len(in_build), bool)
+    top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
+    return np.asarray(in_build[:, 2] < top_mm + site.options.over_beside_mm)
 
 
 def _laid_beyond(
@@ -146,9 +152,7 @@ def _laid_beyond(
     """
     offset_mm, tolerance_mm = laid.expected_offset_mm(in_build, normal, deviation_mm)
     least_mm, over_mm = np.zeros(len(in_build)), site.options.over_beside_mm
-    if site.strands is not None:
-        top_mm = site.strands.sample(in_build[:, :2], outside_mm=-np.inf)
-        least_mm[in_build[:, 2] < top_mm + over_mm] = site.options.stray_mm
+    least_mm[_by_supports(site, in_build)] = site.options.stray_mm
     if site.beside is not None:
         beside = in_build[:, 2] < _highest_around(site.beside, in_build, site.options) + over_mm
         least_mm[beside] = np.maximum(least_mm[beside], deviation_mm[beside])
