@@ -60,6 +60,8 @@ MOST_RIDGE_STEPS = 4000
 LEAST_VOID_MM = 0.03
 MENISCUS = np.pi / 8  # mean depth of half a circle over a groove, in groove widths
 LEAST_SPILL_MM = 0.005  # what stands less above the nozzle is not planed off
+# With more plastic than so much of what its layer has room for, a strand hangs where it may.
+THICK_LAYERS = 1.1
 FREE_COLUMNS = 0.5  # a column that the strand's edge crosses is its own
 NARROWEST_BORES = 0.45  # half width: with less plastic a strand is lower, not narrower
 BESIDE_COLUMNS = 1.5  # from a column at a strand's edge to what lies beside the strand
@@ -515,7 +517,7 @@ def deposit(world, head, path, window, state):
                     )
                 laid_z, gap = height_of_strand(world, head, path, state, s, k, x, y, z)
                 hangs, wide = thickness[s], half
-                if free > thickness[s]:
+                if free > THICK_LAYERS * thickness[s]:
                     below = highest_below(world, head, int(state[LAYER]), x, y, laid_z)
                     if laid_z - below > gap:
                         hangs, wide = free, 0.5 * head.beside
