@@ -145,7 +145,7 @@ def _films(sought: Sought, which: Numbers) -> Mask:
     What is left of a thin roof lies as near to the template's surface, but to its other side.
     """
     s, options = sought.evidence.surfels, sought.options.voxels
-    depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_deviation_mm[which])
+    depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_mean(s.deviation_mm, which))
     film = (depth_mm < options.film_mm) & (np.abs(depth_mm - wide_mm) < options.even_mm)
     some = which[film]
     outward = sought.template.distance_and_gradient(s.place_mm[some])[1]

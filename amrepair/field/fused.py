@@ -42,8 +42,6 @@ class Surfels:
         (s,) mean f of the points in each cell.
     count
         (s,) points in each cell.
-    wide_deviation_mm
-        (s,) the mean f over the cell and its 26 neighbours: a bead-sized window.
     spread_mm
         Robust standard deviation of f within a cell: the noise as the scan shows it.
     table
@@ -61,7 +59,6 @@ class Surfels:
     place_mm: Points
     deviation_mm: Values
     count: Numbers
-    wide_deviation_mm: Values
     spread_mm: float
     table: Int[np.ndarray, "s 27"]
     of_point: Int[np.ndarray, " m"]
@@ -105,10 +102,15 @@ class Surfels:
         place[which] += moved_mm[:, None] * normal
         return replace(self, place_mm=place)
 
-    def wide_mean(self, value: Values) -> Values:
-        """(s,) the mean of a value of the cells over each of them and its 26 neighbours."""
+    def wide_mean(
+        self, value: Values, which: Int[np.ndarray, " q"] | slice = slice(None)
+    ) -> Float[np.ndarray, " q"]:
+        """(q,) the mean of a value of the cells over each and its 26 neighbours: a bead's window.
+
+        Of the cells in `which`, all by default.
+        """
         sums = np.stack([self.count * value, self.count], axis=1)
-        wide = kernels.neighbour_sums(self.table, np.ascontiguousarray(sums, dtype=np.float64))
+        wide = kernels.neighbour_sums(self.table[which], sums)
         return np.asarray(wide[:, 0] / wide[:, 1])
 
     def by_view(self, view_index: Int[np.ndarray, " m"]) -> Shares:
@@ -143,7 +145,6 @@ def make_surfels(
     sums = kernels.cell_sums(of_point, points_mm, origin, deviation_mm, len(keys))
     count, mean_f = sums[:, 11], sums[:, 3] / sums[:, 11]
     table = kernels.neighbour_table(keys, *strides)
-    wide = kernels.neighbour_sums(table, np.ascontiguousarray(sums[:, [3, 11]]))
     if scan.sensors_mm is not None and scan.sensor_index is not None:
         told = of_point, scan.sensor_index, np.ascontiguousarray(scan.sensors_mm)
         sensor_mm = kernels.sensor_sums(*told, len(keys)) / count[:, None]
@@ -155,7 +156,6 @@ def make_surfels(
         place_mm=sums[:, :3] / count[:, None] + origin,
         deviation_mm=mean_f,
         count=count.astype(np.int64),
-        wide_deviation_mm=wide[:, 0] / wide[:, 1],
         spread_mm=float(np.sqrt(np.median(variance[many]))) if many.any() else 0.0,
         table=table,
         of_point=of_point,

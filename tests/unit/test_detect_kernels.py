@@ -132,7 +132,7 @@ def test_a_string_is_told_along_its_length_and_noise_is_not(seed: int, turned: f
         high = points + high_mm * string[:, None] * (0.0, 0.0, 1.0)
         scan = Scan(high, 0.03, "template")
         surfels = make_surfels(scan, high[:, 2] - 10.0, np.ones(len(high), bool))
-        maybe = surfels.wide_deviation_mm > 0.08
+        maybe = surfels.wide_mean(surfels.deviation_mm) > 0.08
         on = on_strands(surfels, block, surfels.deviation_mm, maybe, **limits)
         if not high_mm:
             assert not on.any()

@@ -12,7 +12,7 @@ from loop_bench import solid_mesh
 from amrepair.frames import Transform
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.sites import sites
-from amrepair.repair import RepairPlan, in_view, plan_repair
+from amrepair.repair import RepairPlan, Site, in_view, plan_repair
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.profiles import load_setup
@@ -22,6 +22,7 @@ from gcode.writer import write
 from tests import analytic
 
 SETUP = load_setup(process="repair_0.20")
+HERE = Transform.identity("build", "template")
 FLOOR_MM, WALL_MM = 0.6, 2.0
 BLOCK = m3.Manifold.cube((20.0, 14.0, 5.0)).translate((90.0, 90.0, 0.0))
 HOLLOW = m3.Manifold.cube((20.0 - 2 * WALL_MM, 14.0 - 2 * WALL_MM, 9.0)).translate(
@@ -44,8 +45,7 @@ def looked_at(
 ) -> RepairPlan:
     """What the final look at a part plans."""
     template = MeshSdf.from_mesh(solid_mesh(drawn))
-    here = Transform.identity("build", "template")
-    site = sites(job, template, here, SETUP)(plan_stops(job, [])[-1])
+    site = sites(job, template, HERE, SETUP)(plan_stops(job, [])[-1])
     sensors = np.array(sensors_mm)
     bed = m3.Manifold.cube((60.0, 60.0, 1.0)).translate((70.0, 70.0, -1.0))
     points, who = analytic.ray_scan(stands + bed, sensors, spacing_mm=0.25, sigma_mm=0.03, seed=1)
@@ -68,10 +68,10 @@ def test_what_a_job_leaves_open_at_its_top_is_not_missing() -> None:
 
 def test_a_part_that_is_closed_is_held_against_its_template() -> None:
     job = job_of(BLOCK)
-    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
+    template = MeshSdf.from_mesh(solid_mesh(BLOCK))
     stop = plan_stops(job, [])[-1]
-    assert sites(job, template, here, SETUP)(stop).planned is None
-    assert sites(job_of(BLOCK - HOLLOW), template, here, SETUP)(stop).planned is not None
+    assert sites(job, template, HERE, SETUP)(stop).planned is None
+    assert sites(job_of(BLOCK - HOLLOW), template, HERE, SETUP)(stop).planned is not None
 
 
 def moved_aside(job: Job, which: np.ndarray, name: str, by_mm: tuple[float, float, float]) -> Job:
@@ -92,26 +92,26 @@ def test_a_tower_is_nothing_to_be_mended() -> None:
     job = job_of(BLOCK)
     tower = np.flatnonzero(job.beads.layer >= 0)[::7]
     beside = moved_aside(job, tower, "Wipe tower", (60.0, 0.0, 0.0))
-    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
-    site = sites(beside, template, here, SETUP)(plan_stops(job, [10])[0])
+    template = MeshSdf.from_mesh(solid_mesh(BLOCK))
+    site = sites(beside, template, HERE, SETUP)(plan_stops(job, [10])[0])
     assert site.planned is not None
     assert site.beside is not None
     assert site.planned.bounds_mm[1, 0] < 130.0 < beside.beads.start_mm[tower, 0].min()
     assert site.beside.box_mm[0] > 130.0
 
 
-def supported() -> Job:
+def supported() -> tuple[Job, Site]:
     """The block's job, beside it strands of a support that end 0.09 mm above its layer 10."""
     job = job_of(BLOCK)
     strands = np.flatnonzero(job.beads.layer == 9)[::3]
-    return moved_aside(job, strands, "Support material", (22.0, 0.0, 0.29))
+    job = moved_aside(job, strands, "Support material", (22.0, 0.0, 0.29))
+    template = MeshSdf.from_mesh(solid_mesh(BLOCK))
+    return job, sites(job, template, HERE, SETUP)(plan_stops(job, [10])[0])
 
 
 def test_a_part_is_as_high_as_its_own_layer_and_not_as_its_support_s() -> None:
     """regression: 0.09 mm of all tops were missing where a support's layer ends between two."""
-    job = supported()
-    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
-    site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
+    job, site = supported()
     assert site.planned is not None
     top_mm = job.layers[10].z_mm
     places = np.array([[x, y, top_mm] for x in (95.0, 100.0, 105.0) for y in (94.0, 100.0)])
@@ -119,10 +119,8 @@ def test_a_part_is_as_high_as_its_own_layer_and_not_as_its_support_s() -> None:
 
 
 def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
-    job = supported()
-    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
-    site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
-    beyond = in_view.off_by_job(site, here)
+    job, site = supported()
+    beyond = in_view.off_by_job(site, HERE)
     assert beyond is not None
     support = job.beads.role == len(job.beads.roles) - 1
     middle = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support] - [0.0, 0.0, 0.1]
@@ -133,10 +131,8 @@ def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
 
 def test_a_support_s_strands_sag_and_the_part_s_beside_them_do_not() -> None:
     """regression: the first tops of a support over its pillars were filled up (1 to 3 mm³)."""
-    job = supported()
-    template, here = MeshSdf.from_mesh(solid_mesh(BLOCK)), Transform.identity("build", "template")
-    site = sites(job, template, here, SETUP)(plan_stops(job, [10])[0])
-    off = in_view.off_by_job(site, here)
+    job, site = supported()
+    off = in_view.off_by_job(site, HERE)
     assert off is not None
     support = job.beads.role == len(job.beads.roles) - 1
     tops = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support]
