@@ -102,10 +102,18 @@ def worlds(missing: m3.Manifold) -> tuple[World, IntervalMap]:
     return world, gone
 
 
-@pytest.mark.parametrize("name", POCKETS)
-def test_a_pocket_is_filled_and_hardly_more_than_that(name: str) -> None:
+Pocket = tuple[str, PatchPlan, HeightField]
+
+
+@pytest.fixture(scope="module", params=POCKETS)
+def pocket(request: pytest.FixtureRequest) -> Pocket:
+    """A pocket's name, its plan and what stands there: planned once for all that is asked of it."""
+    return request.param, *plan_of(POCKETS[request.param])
+
+
+def test_a_pocket_is_filled_and_hardly_more_than_that(pocket: Pocket) -> None:
+    name, plan, _ = pocket
     missing = POCKETS[name]
-    plan, _ = plan_of(missing)
     world, gone = worlds(missing)
     world.deposit(motion_of(plan.toolpath))
     after = world.snapshot(gone.window)
@@ -117,10 +125,9 @@ def test_a_pocket_is_filled_and_hardly_more_than_that(name: str) -> None:
     assert excess <= 0.06, f"excess {excess:.3f}"
 
 
-@pytest.mark.parametrize("name", POCKETS)
-def test_the_plastic_is_the_missing_volume(name: str) -> None:
+def test_the_plastic_is_the_missing_volume(pocket: Pocket) -> None:
+    name, plan, _ = pocket
     missing = POCKETS[name]
-    plan, _ = plan_of(missing)
     # what lies against the walls at depth is out of the nozzle's reach and left out
     assert 0.88 * missing.volume() <= plan.beads_mm3 <= 1.04 * missing.volume()
     assert plan.reachable_mm3 + sum(u.volume_mm3 for u in plan.unreachable) == pytest.approx(
@@ -128,20 +135,18 @@ def test_the_plastic_is_the_missing_volume(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", POCKETS)
-def test_no_bead_is_wider_than_two_nozzles_by_what_the_text_says(name: str) -> None:
+def test_no_bead_is_wider_than_two_nozzles_by_what_the_text_says(pocket: Pocket) -> None:
     # regression: widths were told for a pass's mean height, where a bead filled a deeper place:
     # up to 1.37 mm
-    plan, _ = plan_of(POCKETS[name])
+    _, plan, _ = pocket
     text = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False).text
     widths = [float(line[7:]) for line in text.splitlines() if line.startswith(";WIDTH:")]
     assert widths
     assert max(widths) <= 2 * SETUP.printer.nozzle_diameter_mm + 1e-9
 
 
-@pytest.mark.parametrize("name", POCKETS)
-def test_a_patch_passes_the_checker(name: str) -> None:
-    plan, field = plan_of(POCKETS[name])
+def test_a_patch_passes_the_checker(pocket: Pocket) -> None:
+    _, plan, field = pocket
     program = write(plan.toolpath, SETUP, title="patch", resume=HOT, restore=False)
     assert not find_refusals(program, SETUP, as_built=field, initial=HOT)
 
