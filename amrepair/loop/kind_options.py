@@ -50,6 +50,9 @@ class KindOptions:
     string_aspect, string_width_mm, string_tall
         A string is this much longer than wide, no wider, and no higher than this share of its
         length.
+    sag_mm, sag_levels
+        Strands over nothing droop by whole millimetres; what is farther below them came from
+        elsewhere. So many heights up to there are asked whether the part is over a place.
     along_cosine
         Along the beads.
     whole_layers
@@ -90,6 +93,8 @@ class KindOptions:
     string_aspect: float = 4.0
     string_width_mm: float = 2.2
     string_tall: float = 0.25
+    sag_mm: float = 5.0
+    sag_levels: int = 12
     along_cosine: float = 0.9
     whole_layers: float = 0.7
     top_cosine: float = 0.8

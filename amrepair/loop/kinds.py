@@ -102,14 +102,16 @@ def typed(
     for region in plan.deficit.regions:
         # of a line that is gone many looks have told, not its depth
         there = 1.0 if region.skipped else _there(region.depth_mm, plan.deficit.tolerance_mm)
-        rim = _at_rim(plan, site, np.asarray(region.box_mm), options)
+        mine, box_mm = pieces[region.label], np.asarray(region.box_mm)
+        excess = region.label is Label.EXCESS
         kind = whole or _of_region(
             region,
-            pieces[region.label],
+            mine,
             flow,
             job,
             line,
-            at_rim=rim,
+            at_rim=not excess and _at_rim(plan, site, box_mm, options),
+            hangs=excess and _hangs(matching(mine, box_mm), plan, site, options),
             mended=mended,
             layer_mm=layer_mm,
             options=options,
@@ -337,6 +339,7 @@ def _of_region(
     line: int,
     *,
     at_rim: bool,
+    hangs: bool,
     mended: manifold3d.Manifold | None,
     layer_mm: float,
     options: KindOptions,
@@ -346,6 +349,8 @@ def _of_region(
     if region.label is Label.EXCESS:
         if flow is not None and flow.type is DefectType.OVER_EXTRUSION:
             return flow
+        if hangs:
+            return TypeGuess(DefectType.SAG, 0.95)
         chain = chain_of(piece, pieces)
         long_mm, wide_mm, _ = spread(chain)
         lies = tall_mm(chain) < options.string_tall * long_mm  # what climbs a wall is its seam
@@ -373,6 +378,29 @@ def _of_region(
     if layers > options.whole_layers or region.type in (DefectType.VOID, DefectType.CHIP):
         return TypeGuess(DefectType.CHIP if at_rim else DefectType.VOID, 0.95)
     return TypeGuess(region.type, 0.95)
+
+
+def _hangs(
+    piece: manifold3d.Manifold | None, plan: RepairPlan, site: Site, options: KindOptions
+) -> bool:
+    """Whether most of what is too much lies close below what the job printed with no support.
+
+    By its upper half: what hangs may reach down to the bed, or nobody saw where it ends.
+    """
+    if piece is None:
+        return False
+    place_mm = np.asarray(piece.to_mesh64().vert_properties)[:, :3]
+    place_mm = place_mm[place_mm[:, 2] >= box_of_solid(piece)[:, 2].mean()]
+    levels = np.arange(1, options.sag_levels + 1) * (options.sag_mm / options.sag_levels)
+    above = place_mm[:, None] + levels[:, None] * np.array([0.0, 0.0, 1.0])
+    inside = site.template.distance(
+        plan.build_from_template.inverse().apply(above.reshape(-1, 3))
+    ).reshape(above.shape[:2])
+    printed_mm = np.inf if site.printed_z_mm is None else site.printed_z_mm
+    under = ((inside < 0.0) & (above[..., 2] < printed_mm)).any(axis=1)
+    if site.strands is not None:
+        under &= ~np.isfinite(site.strands.sample(place_mm[:, :2], outside_mm=-np.inf))
+    return float(under.mean()) > 0.5
 
 
 def _is_over(

@@ -267,6 +267,9 @@ FINDINGS: tuple[Row, ...] = (
         "the head would hit it on its next moves; cut it off, or end the print"),
     Row("F5", Action.GO_ON, (_EXCESS, _is("type", (DefectType.STRING,))),
         "strings come off by hand, and the nozzle melts through them"),
+    Row("F5a", Action.GO_ON, (_EXCESS, _is("type", (DefectType.SAG,))),
+        "what the job laid over nothing has sagged; printing cannot lift it, supports would have "
+        "held it"),
     Row("F6", Action.LOWER_NEXT, (_EXCESS, _from("volume_mm3", "least_excess_mm3"),
                                   _from("thickness_layers", "least_layers"),
                                   _below("thickness_layers", "excess_layers"),

@@ -37,6 +37,7 @@ class DefectType(StrEnum):
     OVER_EXTRUSION = "over_extrusion"
     BLOB = "blob"
     STRING = "string"
+    SAG = "sag"
     LAYER_SHIFT = "layer_shift"
     WARP = "warp"
     DETACHED = "detached"

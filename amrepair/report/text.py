@@ -28,6 +28,7 @@ _DEFECT_NAMES = {
     "over_extrusion": ("patch of thick extrusion", "patches of thick extrusion"),
     "blob": ("blob", "blobs"),
     "string": ("string", "strings"),
+    "sag": ("sagging overhang", "sagging overhangs"),
     "layer_shift": ("shift of layers", "shifts of layers"),
     "warp": ("warped place", "warped places"),
     "detached": ("part off the bed", "parts off the bed"),

@@ -43,6 +43,7 @@ CASES = {
     "F3": replace(VOID, type=DefectType.WARP),
     "F4": replace(BLOB, hit_mm=0.4),
     "F5": replace(BLOB, type=DefectType.STRING),
+    "F5a": replace(BLOB, type=DefectType.SAG),
     "F6": replace(BLOB, thickness_layers=0.8),
     "F7": BLOB,
     "F8a": replace(VOID, volume_mm3=0.5, defect_mm3=0.8),

@@ -7,10 +7,11 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from manifold3d import Manifold
 
 from amrepair.frames import Transform
@@ -21,8 +22,10 @@ from amrepair.loop.shapes import last_beads
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import plan_repair
-from gcode.meshes import box_of_solid
+from amrepair.template import MeshSdf
+from gcode.meshes import box_of_solid, mesh_of
 from gcode.profiles import load_setup
+from gcode.surfaces import HeightField
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_kinds.py"
 
@@ -206,8 +209,8 @@ def told_of(  # type: ignore[no-untyped-def]
         box_mm=box_mm,
     )  # fmt: skip
     return kinds._of_region(
-        region, [piece], flow, job, stop.line, at_rim=at_rim, mended=mended, layer_mm=0.2,
-        options=USUAL_KINDS,
+        region, [piece], flow, job, stop.line, at_rim=at_rim, hangs=False, mended=mended,
+        layer_mm=0.2, options=USUAL_KINDS,
     ).type  # fmt: skip
 
 
@@ -295,3 +298,42 @@ def test_what_is_whole_again_at_the_end_is_no_clog(
     noisy = top_of(np.where(gone, -0.2, 0.0), beads[:, :2], 0.1)
     found = kinds._flow(noisy, job, stop.line, 0.2, USUAL_KINDS)
     assert found is None or found.type is not DefectType.CLOG
+
+
+@pytest.mark.parametrize(
+    ("low_mm", "high_mm", "beside_mm", "printed_mm", "supported", "hangs"),
+    [
+        (7.0, 10.0, 0.0, None, False, True),
+        (0.0, 9.5, 0.0, None, False, True),  # nobody saw where it ends
+        (1.0, 3.0, 0.0, None, False, False),  # a blob on the post, far below
+        (7.0, 10.0, 8.0, None, False, False),  # beside the plate
+        (7.0, 10.0, 0.0, 9.0, False, False),  # the plate is not printed yet
+        (7.0, 10.0, 0.0, None, True, False),
+    ],
+)
+def test_what_hangs_below_an_overhang_has_sagged(
+    low_mm: float,
+    high_mm: float,
+    beside_mm: float,
+    printed_mm: float | None,
+    supported: bool,
+    hangs: bool,
+) -> None:
+    # a plate of 30 × 10 mm, 10 mm up on a post at its end
+    part = Manifold.cube((10.0, 10.0, 10.0)) + Manifold.cube((30.0, 10.0, 3.0)).translate(
+        (0.0, 0.0, 10.0)
+    )
+    corners, faces = mesh_of(part)
+    template = MeshSdf.from_mesh(trimesh.Trimesh(corners, faces))
+    piece = Manifold.cube((6.0, 5.0, high_mm - low_mm)).translate((14.0, 2.0, low_mm))
+    piece = piece.refine_to_length(1.0).translate((0.0, beside_mm, 0.0))
+    placed = Transform.on_bed(50.0, 60.0, 0.0, 0.0)
+    below = (
+        HeightField(np.array([50.0, 50.0]), 1.0, np.full((40, 40), 9.9), np.ones((40, 40), bool))
+        if supported
+        else None
+    )
+    site = SimpleNamespace(template=template, printed_z_mm=printed_mm, strands=below)
+    plan = SimpleNamespace(build_from_template=placed)
+    piece = piece.translate((50.0, 60.0, 0.0))
+    assert kinds._hangs(piece, plan, site, USUAL_KINDS) == hangs  # type: ignore[arg-type]
