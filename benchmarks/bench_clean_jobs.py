@@ -229,7 +229,14 @@ def scans_of(
         distance_mm=max(300.0, 2 * float(high[2]) + 100.0),
         oblique=model.oblique_views,
     )
-    scanner = SimulatedScanner(world, pose=pose, sensors_mm=sensors_mm, rng=rng, model=model)
+    scanner = SimulatedScanner(
+        world,
+        pose=pose,
+        sensors_mm=sensors_mm,
+        rng=rng,
+        model=model,
+        recording=told.recording(scanner_name),
+    )
     done = -1
     for stop in stops:
         layer = len(job.layers) - 1 if stop.layer_index is None else stop.layer_index
@@ -315,9 +322,8 @@ def run_job(
     template = MeshSdf.from_mesh(mesh_called(part))
     placed = locate_part(job, template, layer_height_mm=layer_mm)
     site_at = sites(job, template, placed, setup)
-    kept = (
-        folder / f"{Path(part).stem}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner_name}.pickle"
-    )
+    scanner = Path(scanner_name).name  # of a recording, its file's
+    kept = folder / f"{Path(part).stem}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner}.pickle"
     scans = kept_scans(kept, lambda: scans_of(job, stops, told, scanner_name, seed))
     seen = []
     for number, (stop, (scan, pose)) in enumerate(zip(stops, scans, strict=True), start=1):

@@ -208,7 +208,7 @@ def _evidence_of(
     """
     evidence = anomaly.evidence
     assert evidence is not None
-    if beads is None:
+    if beads is None or anomaly.erratic:
         return evidence, None, None
     lines, by_rays = skipped(beads, scan, evidence, template, options)
     if not len(lines.width_mm):

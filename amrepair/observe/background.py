@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Mask, Points, Values
+from amrepair.frames import cells_of
 from amrepair.observe.options import USUAL_BACKGROUND, BackgroundOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -31,9 +32,37 @@ def background(
         return np.asarray((f_mm > options.most_excess_mm) | beside)
     band_mm = max(options.band_mm, options.noise_sigmas * scan.sigma_mm)
     bed = (scan.points_mm[:, 2] < low_z + band_mm) & (f_mm > band_mm / 2)
+    bed |= _of_bed(scan.points_mm, low_z, f_mm > band_mm / 2, band_mm, options)
     inside_band = scan.points_mm[:, 2] > low_z - band_mm
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
     return bed | (f_mm > options.most_excess_mm) | (~inside_band & (f_mm > options.below_mm))
+
+
+def _of_bed(
+    points_mm: Points, low_z_mm: float, beside: Mask, band_mm: float, options: BackgroundOptions
+) -> Mask:
+    """Points over places of the bed that lie no higher, as a whole, than noise lifts them.
+
+    A real scanner's errors hang together and have long tails: single points stand out of any band.
+    How far they go the bed itself says, since nothing lies below it.
+    """
+    height_mm = points_mm[:, 2] - low_z_mm
+    of_bed = np.zeros(len(points_mm), bool)
+    near = np.flatnonzero(beside & (np.abs(height_mm) < options.below_mm))
+    if len(near) == 0:
+        return of_bed
+    xy_mm = points_mm[near, :2]
+    cell = cells_of(xy_mm, xy_mm.min(axis=0), options.bed_cell_mm)
+    key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    rising = np.lexsort((height_mm[near], key))
+    first = np.flatnonzero(np.diff(key[rising], prepend=-1))
+    count = np.diff(first, append=len(near))
+    middle_mm = height_mm[near[rising[first + count // 2]]]
+    known = count >= options.bed_points
+    lowest_mm = float(middle_mm[known].min(initial=0.0))
+    low = known & (middle_mm < max(band_mm, -lowest_mm))
+    of_bed[near[rising]] = np.repeat(low, count)
+    return of_bed
 
 
 def _rim_mm(scan: Scan, options: BackgroundOptions) -> float:

@@ -19,6 +19,8 @@ class BackgroundOptions:
         Of a plane's points one in 30,000 lies farther from it.
     below_mm
         Under the bed's band, what lies so far from the part is none of it.
+    bed_cell_mm, bed_points
+        What lies on the bed is told from it by places so wide, of so many points or more.
     seen_underside, underside_rim_mm, foot_cell_mm, most_foot
         So much of the underside seen, so far from its rim: nothing lies under the part, there is no
         bed. It is counted in such cells, on so many points.
@@ -28,6 +30,8 @@ class BackgroundOptions:
     band_mm: float = 0.35
     noise_sigmas: float = 4.0
     below_mm: float = 1.0
+    bed_cell_mm: float = 1.0
+    bed_points: int = 3
     seen_underside: float = 0.3
     underside_rim_mm: float = 0.15
     foot_cell_mm: float = 1.0

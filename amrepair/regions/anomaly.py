@@ -114,6 +114,8 @@ class AnomalyMap:
         stood in), and views that were left out.
     calibration, options
         What stood in for the scan's own word on its errors, and what the test was set to.
+    erratic
+        Errors stand out in many places: a single line of a job is not told from them.
     """
 
     points_mm: Points
@@ -137,6 +139,7 @@ class AnomalyMap:
     contradicting: tuple[Contradiction, ...] = ()
     calibration: Calibration | None = None
     options: RegionOptions | None = None
+    erratic: bool = False
 
     def told(self) -> tuple[str, ...]:
         """What belongs to the whole part or to whole views, in sentences."""

@@ -54,7 +54,8 @@ def detect(
     options
         What the test is set to; None takes the defaults.
     calibration
-        What sound parts look like to this scanner; None: as the scan itself tells.
+        What sound parts look like to this scanner; None: as the scan itself tells, and so, too,
+        where normal noise is given and the scan itself contradicts.
     top_z_mm
         Height of the layer just printed, where the template ends there: what is missing under
         that plane is judged with `top_allowance_mm`, since the job says exactly where it lies.
@@ -97,7 +98,7 @@ def detect(
     held = "told" if top_z_mm is not None else pose
     seen, sites, nuisance, contradicting = agreed(observe, held, options)
     progress("detect", 1.0, 4.0)
-    test = _tested(seen, sites, options, calibration)
+    calibration, test = _tested(seen, sites, options, calibration)
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, options, calibration)
     progress("detect", 3.0, 4.0)
@@ -129,15 +130,20 @@ def detect(
         contradicting=contradicting,
         calibration=calibration,
         options=options,
+        erratic=_erratic(test.levels),
     )
 
 
 def _tested(
     seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
-) -> Tested:
-    """Test every scale, and grow regions from where it is significant."""
+) -> tuple[Calibration | None, Tested]:
+    """What each scale was tested by, and regions grown from where it is significant."""
     cells, crossed = slice(len(seen.surfels)), slice(len(seen.surfels), None)
     levels = tested(sites, options, calibration)
+    if calibration == NORMAL_NOISE:
+        own = tested(sites, options, None)
+        if _erratic(own):  # the scan itself says that its errors are not normal
+            levels, calibration = own, None
     # what errors leave in strips neither a scan nor a calibration tells: only where they are known
     # to be normal is there any
     strands = np.zeros(len(seen.surfels), bool)
@@ -153,7 +159,7 @@ def _tested(
     gone_p_value[seen.crossed.which] = np.exp(log_p[0, crossed])
     errors = as_student(levels[1].quantile, levels[1].freedom)
     noise_mm = float(np.median(errors * levels[1].error_mm))
-    return Tested(
+    return calibration, Tested(
         levels,
         noise=noise_of(levels, seen.shares, seen.scan.sigma_mm, options),
         missing=labels[0, cells],
@@ -164,6 +170,14 @@ def _tested(
         limit_mm=tolerances_mm[0] + noise_mm,
         top_mm=tolerances_mm[1] + noise_mm,
     )
+
+
+def _erratic(levels: tuple[Level, ...]) -> bool:
+    """Whether sound places stand out in so many places, low and high, that their tails are told.
+
+    What went wrong with a print is too much or too little; a scanner's errors are both.
+    """
+    return all(any(level.tails[side].scale > 0.0 for level in levels[:2]) for side in (0, 1))
 
 
 def _bounded(
