@@ -8,6 +8,7 @@ from scipy.special import ndtr
 from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.groups import group_points, touching_mm
+from amrepair.field.scales import RANK
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
@@ -98,9 +99,9 @@ def detect(
     held = "told" if top_z_mm is not None else pose
     seen, sites, nuisance, contradicting = agreed(observe, held, options)
     progress("detect", 1.0, 4.0)
-    calibration, test = _tested(seen, sites, options, calibration)
+    by, test = _tested(seen, sites, options, calibration)
     progress("detect", 2.0, 4.0)
-    evidence, surface_label = _bounded(seen, test, options, calibration)
+    evidence, surface_label = _bounded(seen, test, options, by)
     progress("detect", 3.0, 4.0)
     regions = find_regions(evidence, test, seen.surface_mm, surface_label, template)
     score = np.abs(seen.f_mm)
@@ -128,9 +129,9 @@ def detect(
         noise=test.noise,
         nuisance=nuisance,
         contradicting=contradicting,
-        calibration=calibration,
+        calibration=by,
         options=options,
-        erratic=_erratic(test.levels),
+        erratic=by != calibration or _erratic(test.levels, options),
     )
 
 
@@ -140,10 +141,8 @@ def _tested(
     """What each scale was tested by, and regions grown from where it is significant."""
     cells, crossed = slice(len(seen.surfels)), slice(len(seen.surfels), None)
     levels = tested(sites, options, calibration)
-    if calibration == NORMAL_NOISE:
-        own = tested(sites, options, None)
-        if _erratic(own):  # the scan itself says that its errors are not normal
-            levels, calibration = own, None
+    if calibration == NORMAL_NOISE and _erratic(levels, options):  # the scan itself contradicts
+        levels, calibration = tested(sites, options, None), None
     # what errors leave in strips neither a scan nor a calibration tells: only where they are known
     # to be normal is there any
     strands = np.zeros(len(seen.surfels), bool)
@@ -172,12 +171,14 @@ def _tested(
     )
 
 
-def _erratic(levels: tuple[Level, ...]) -> bool:
-    """Whether sound places stand out in so many places, low and high, that their tails are told.
+def _erratic(levels: tuple[Level, ...], options: RegionOptions) -> bool:
+    """Whether so many places stand out as tell a tail, and not all of them to one side.
 
-    What went wrong with a print is too much or too little; a scanner's errors are both.
+    What went wrong with a print is too much or too little; a scanner's errors are both. Places
+    beyond what is allowed by `grow_sigmas`: normal noise alone leaves hardly one.
     """
-    return all(any(level.tails[side].scale > 0.0 for level in levels[:2]) for side in (0, 1))
+    low, high = (int((peaks > options.grow_sigmas).sum()) for peaks in levels[0].peaks)
+    return min(low, high) > 0 and low + high >= 2 * RANK
 
 
 def _bounded(
