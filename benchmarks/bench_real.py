@@ -103,6 +103,9 @@ def run(command: Sequence[str], limit_s: float) -> Run:
     try:
         result = json.loads(text)
     except json.JSONDecodeError:
+        result = None
+    if result is None or "error" in result:
+        why = why if result is None else result["error"]
         late = f"no answer in {limit_s:g} s; " if wall_s > limit_s else ""
         result, why = None, f"{late}exit {process.returncode}: {why[-300:]}"
     return Run(result, "" if result else why, wall_s, peak_gb)
