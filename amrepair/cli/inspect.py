@@ -317,6 +317,8 @@ def _told(anomaly: AnomalyMap, calibration: str | None) -> dict[str, Any]:
 def _refuse_too_noisy(anomaly: AnomalyMap, smallest_mm: float | None, scan: Path) -> None:
     """Refuse a scan that cannot show the smallest defect asked for."""
     assert anomaly.noise is not None
+    if smallest_mm is not None and anomaly.noise.too_sparse:
+        raise InputError(f"{scan}: {anomaly.noise.told_sparse()}")
     area_mm2, depth_mm = min(anomaly.noise.smallest_mm, key=lambda pair: pair[1])
     if smallest_mm is not None and depth_mm > smallest_mm:
         raise InputError(

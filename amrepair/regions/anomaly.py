@@ -142,8 +142,10 @@ class AnomalyMap:
     erratic: bool = False
 
     def told(self) -> tuple[str, ...]:
-        """What belongs to the whole part or to whole views, in sentences."""
+        """What belongs to the whole part or to whole views, or was not judged, in sentences."""
         whole = () if self.nuisance is None else self.nuisance.told()
         by = self.calibration
         judged = () if by is None or by == NORMAL_NOISE else (by.told(),)
-        return (*judged, *(one.told() for one in self.contradicting), *whole)
+        noise = self.noise
+        unjudged = () if noise is None or not noise.too_sparse else (noise.told_sparse(),)
+        return (*judged, *unjudged, *(one.told() for one in self.contradicting), *whole)

@@ -14,6 +14,10 @@ from amrepair.regions.significance import OUTLIER_SIGMAS, Level, point_sigma_mm
 
 # Errors hang together over the distance at which their variogram has reached this share (1 − 1/e).
 SILL_SHARE = 0.632
+# A window is a cell with those around it, as they lie in a surface.
+CELLS_OF_WINDOW = 9.0
+# Of a scan that shows a surface no more than a tenth strays, or lies alone at a rim.
+LEAST_JUDGED = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,8 @@ class Noise:
         Of each scale: area of a window, mm², and the least depth that it would show, mm.
     source
         Where the noise is from: this scan, or a profile where it has too few points.
+    judged_share
+        Of the points: of the others too few lie together for anything to be told of them.
     """
 
     sigma_mm: float
@@ -42,6 +48,21 @@ class Noise:
     view_disagreement_mm: float | None
     smallest_mm: tuple[tuple[float, float], ...]
     source: str
+    judged_share: float = 1.0
+
+    @property
+    def too_sparse(self) -> bool:
+        """Whether more is not judged than strays."""
+        return self.judged_share < LEAST_JUDGED
+
+    def told_sparse(self) -> str:
+        """What a scan with too few points cannot tell, in a sentence."""
+        cell_mm = float(np.sqrt(self.smallest_mm[0][0] / CELLS_OF_WINDOW))
+        return (
+            f"Only {100 * self.judged_share:.0f} % of the points could be judged: elsewhere fewer "
+            f"than two lie in a cell of {cell_mm:.1f} mm, and a defect there would not be seen; "
+            "scan more finely."
+        )
 
     def told(self) -> str:
         """All but the smallest depths, in a sentence."""
@@ -77,6 +98,7 @@ def noise_of(
     first = levels[0].scale
     told = len(first) >= options.least_cells
     sigma_mm = point_sigma_mm(first) if told else profile_mm
+    judged = first.is_surface
     off = np.abs(first.value_mm - first.median_mm) > OUTLIER_SIGMAS * np.maximum(
         first.noise_mm, 1e-9
     )
@@ -86,9 +108,10 @@ def noise_of(
         correlation_mm=_correlation_mm([level.scale for level in levels[1:]]),
         view_disagreement_mm=None if shares is None else shares.apart_mm,
         smallest_mm=tuple(
-            (9.0 * level.scale.cell_mm**2, level.smallest_mm) for level in levels[1:]
+            (CELLS_OF_WINDOW * level.scale.cell_mm**2, level.smallest_mm) for level in levels[1:]
         ),
         source="this scan" if told else f"the profile's, {len(first)} cells are too few to tell",
+        judged_share=float(first.weight[judged].sum() / first.weight.sum()),
     )
 
 

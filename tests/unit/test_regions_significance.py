@@ -261,3 +261,24 @@ def test_the_promise_of_false_regions_holds_within_a_factor_of_three(
     lumpy = sum(len(detect(rough(ball, seed), ball).regions) for seed in range(200))
     assert normal <= 0.15 * 200
     assert lumpy <= 0.15 * 200
+
+
+def test_a_scan_too_sparse_to_be_judged_says_so_and_is_refused(ball: AnalyticTemplate) -> None:
+    """Regression: a point every 3 mm, and "0 regions" was said of a dent 4 mm deep."""
+    hollow = box((-6, -6, BALL_MM - 4), (6, 6, BALL_MM + 1))
+    judged = []
+    for spacing_mm in (3.2, 0.8):
+        points = sample_surface(ball.body - hollow.body, spacing_mm, seed=3)[0]
+        found = detect(Scan(points, 0.04, "template"), ball)
+        assert found.noise is not None
+        judged.append((found.noise.judged_share, len(found.regions), " ".join(found.told())))
+        if found.noise.too_sparse:
+            with pytest.raises(InputError, match="scan more finely"):
+                _refuse_too_noisy(found, 2.0, Path("sparse.ply"))
+        _refuse_too_noisy(found, None, Path("sparse.ply"))
+    sparse, dense = judged
+    assert sparse[0] < 0.5
+    assert "of the points could be judged" in sparse[2]
+    assert dense[0] > 0.95
+    assert dense[1] == 1
+    assert "could be judged" not in dense[2]
