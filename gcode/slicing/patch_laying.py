@@ -118,7 +118,9 @@ def end(
         pen.add(FinishMoves())
         return
     printer = setup.printer
-    safe_mm = min(max(field.top_mm + STANDALONE_LIFT_MM, printer.park_mm[2]), printer.max_z_mm)
+    # what was laid may be higher than all that stood there
+    over_mm = max(field.top_mm, here[2]) + STANDALONE_LIFT_MM
+    safe_mm = min(max(over_mm, printer.park_mm[2]), printer.max_z_mm)
     pen.move_to(np.array([*here[:2], safe_mm]))
     pen.move_to(np.array([*printer.park_mm[:2], safe_mm]))
     pen.add(FinishMoves())

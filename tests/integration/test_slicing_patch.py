@@ -192,6 +192,19 @@ def test_a_standalone_patch_never_homes_z_and_ends_cold() -> None:
     assert "M140 S0" in program.text
 
 
+def test_a_patch_higher_than_all_that_stands_ends_above_itself() -> None:
+    # regression: the last lift went 5 mm over what stood there before, down into the last bead, and
+    # the checker refused the program: whatever lost more than 5 mm off its top was never mended
+    whole = m3.Manifold.cube((6.0, 6.0, 22.0)).translate((70.0, 70.0, 0.0))
+    missing = whole.trim_by_plane((0.0, 0.0, 1.0), 16.0)
+    field = HeightField.from_manifold(whole - missing, 0.1, margin_mm=8.0)
+    grid = LayerGrid.from_setup(SETUP)
+    plan = slice_patch(missing, SETUP, as_built=field, grid=grid, standalone=True)
+    program = write(plan.toolpath, SETUP, title="patch")
+    assert not find_refusals(program, SETUP, as_built=field, patch=True)
+    assert plan.toolpath.extrusions[-1].points_mm[-1, 2] == pytest.approx(22.0)
+
+
 def test_a_deep_narrow_shaft_is_out_of_reach_and_said_so() -> None:
     shaft = m3.Manifold.cube((3.0, 3.0, 3.6)).translate((73.0, 73.0, TOP_MM - 3.6))
     plan, _ = plan_of(shaft)
