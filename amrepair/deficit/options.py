@@ -84,7 +84,9 @@ class HeightOptions:
     most_steps_down
         By which what nobody saw is followed down.
     off_sigma
-        In the scan's noise: how far a point is off upwards or aside, and tells of nothing.
+        In the scan's noise: how far a point is off upwards or aside, and tells of nothing. Of the
+        thousands on walls beside what is missing one in fifty lies two off, and each would keep
+        the head away.
     others_near, beside_spacings
         On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
     """
@@ -106,7 +108,7 @@ class HeightOptions:
     unseen_fin_cells: int = 8
     chance_cells: int = 5
     most_steps_down: int = 64
-    off_sigma: float = 2.0
+    off_sigma: float = 3.5
     others_near: int = 2
     beside_spacings: float = 2.0
 

@@ -12,6 +12,9 @@ AROUND_CELLS, SIDE_CELLS = 2, 3
 LEAST_WALL_POINTS = 8
 # Millimetres of height per cell away: what is steeper is another surface.
 STEEPEST_CELL_MM = 0.15
+# No farther off a plane's ends may be told to lie on two sides of a column's middle: three standard
+# deviations of the mean of some twenty points.
+EVEN_ENDS_MM = 0.03
 
 
 @njit(cache=True, nogil=True)
@@ -58,7 +61,8 @@ def sharpened(
     """(q,) heights of the columns asked about, (q,) `iy` and `ix`.
 
     A column whose middle lies inside the plane of the wall beside it, at its top and at its foot,
-    is as high as what stands around; outside, as low.
+    is as high as what stands around; outside, as low. Where a plane through it is upright but for
+    its own error, the wall's middle decides.
     """
     ny, nx = z.shape
     out = np.empty(len(iy))
@@ -95,7 +99,11 @@ def sharpened(
         level = plane[3] * (x - plane[0]) + plane[4] * (y - plane[1])
         at_top = turn * (level + plane[5] * (high - plane[2]))
         at_foot = turn * (level + plane[5] * (low - plane[2]))
-        if (at_top > 0) != (at_foot > 0) or (at_top > 0) == (z[i, j] <= middle):
+        if (at_top > 0) != (at_foot > 0):
+            if max(abs(at_top), abs(at_foot)) > EVEN_ENDS_MM:
+                continue
+            at_top = turn * level
+        if (at_top > 0) == (z[i, j] <= middle):
             continue
         found = False
         for row in range(max(i - 1, 0), min(i + 2, ny)):
