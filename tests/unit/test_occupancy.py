@@ -243,21 +243,6 @@ def test_a_dent_at_the_rim_of_what_nobody_saw_does_not_take_it_along() -> None:
     assert 0.8 * gone.volume() < deficit.missing_mm3 < 1.5 * gone.volume()
 
 
-@pytest.mark.parametrize(
-    ("size", "at"), [((9, 9, 12), (33, 17, -1)), ((8, 8, 12), (16, 8, -1))], ids=["corner", "hole"]
-)
-def test_what_is_gone_down_to_an_unseen_underside_is_measured(
-    size: tuple[float, float, float], at: tuple[float, float, float]
-) -> None:
-    """Regression: of the underside beside it as much was taken along, 1.5 of it in all."""
-    cut = m3.Manifold.cube(size).translate(at)
-    block = analytic.box((0, 0, 0), (40, 24, 10))
-    points, _ = analytic.noisy_scan_points(block.body - cut, spacing_mm=0.5, sigma_mm=0.05, seed=3)
-    above = points[points[:, 2] > 0.4]
-    deficit = compute_deficit(Scan(above, 0.05, "template"), block, build_from_template=PLACED)
-    assert deficit.missing_mm3 == pytest.approx((block.body ^ cut).volume(), rel=0.1)
-
-
 @pytest.mark.slow
 def test_a_hollow_under_a_film_is_open_though_its_mouth_is_narrow() -> None:
     """Regression: surface with material on both sides cost nothing, and 0.09 of it was found."""
