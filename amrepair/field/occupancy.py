@@ -534,7 +534,9 @@ def _as_seen(solid: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
     evidence of a void. A void that takes an area M of the template's surface has a broken edge: if
     it goes right through, around M/2, at least as long as a circle's and a bead thick.
     """
-    found, designed = solid.copy(), grid.f_mm < 0
+    designed = grid.f_mm < 0
+    solid = solid | _guessed(solid, designed, scan, grid)
+    found = solid.copy()
     index, ok = _cells(scan.broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
     at = tuple(index[ok].T)
     cross = ndimage.generate_binary_structure(3, 1)
@@ -554,7 +556,7 @@ def _as_seen(solid: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
             least_mm2 = scan.options.least_seen * scan.options.bead_mm * around_mm
         alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
-    return found | _guessed(found, designed, scan, grid)
+    return found
 
 
 def _guessed(solid: VoxelMask, designed: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
