@@ -528,15 +528,13 @@ def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid) -> Mask:
 
 
 def _as_seen(solid: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
-    """The same, but as designed where nothing or too little that is broken bounds what differs.
+    """The same, but as designed where too little that is broken bounds what differs.
 
     What hides a part of the surface hides all of it at once, so that no number of unseen places is
     evidence of a void. A void that takes an area M of the template's surface has a broken edge: if
     it goes right through, around M/2, at least as long as a circle's and a bead thick.
     """
-    designed = grid.f_mm < 0
-    solid = solid | _guessed(solid, designed, scan, grid)
-    found = solid.copy()
+    found, designed = solid.copy(), grid.f_mm < 0
     index, ok = _cells(scan.broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
     at = tuple(index[ok].T)
     cross = ndimage.generate_binary_structure(3, 1)
@@ -557,29 +555,6 @@ def _as_seen(solid: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
         alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
     return found
-
-
-def _guessed(solid: VoxelMask, designed: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
-    """What is said to be empty, but ends nearest to where no broken surface was scanned.
-
-    There the cheapest labelling ends a void at the smallest surface that closes it: a dent at the
-    rim of a dome that nobody looked at would take the dome along.
-    """
-    void = designed & ~solid
-    ends = void & ndimage.binary_dilation(solid & designed)
-    guessed = np.zeros_like(void)
-    if not ends.any():
-        return guessed
-    middle_mm = grid.low_mm + (np.argwhere(ends) + 0.5) * grid.voxel_mm
-    within_mm = scan.options.gap_spacings * scan.spacing_mm + grid.voxel_mm
-    seen = np.zeros_like(void)
-    seen[ends] = has_near(middle_mm, scan.broken.place_mm, within_mm)
-    (box,) = ndimage.find_objects(void.astype(np.int8))
-    nearest = ndimage.distance_transform_edt(
-        ~ends[box], return_distances=False, return_indices=True
-    )
-    guessed[box] = void[box] & ~seen[box][tuple(nearest)]
-    return guessed
 
 
 def _cells(
