@@ -240,7 +240,7 @@ def with_what_stands_out(
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)
-    np.maximum.at(z_mm, tuple(index[inside].T), out[inside, 2] - off_mm)
+    np.maximum.at(z_mm, tuple(index[inside].T), out[inside, 2] - options.crest_sigma * sigma_mm)
     return field.raised(z_mm)
 
 

@@ -87,6 +87,8 @@ class HeightOptions:
         In the scan's noise: how far a point is off upwards or aside, and tells of nothing. Of the
         thousands on walls beside what is missing one in fifty lies two off, and each would keep
         the head away.
+    crest_sigma
+        In the scan's noise: the highest of the points on what stands out lies so far over it.
     others_near, beside_spacings
         On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
     """
@@ -109,6 +111,7 @@ class HeightOptions:
     chance_cells: int = 5
     most_steps_down: int = 64
     off_sigma: float = 3.5
+    crest_sigma: float = 2.0
     others_near: int = 2
     beside_spacings: float = 2.0
 
