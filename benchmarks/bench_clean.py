@@ -38,7 +38,7 @@ from amrepair.repair import Site, plan_repair
 from amrepair.scans import ScanRequest
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
-from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
+from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from amrepair.template import PlannedSdf, load_mesh
 from gcode.firmware.motion import MotionBatch
@@ -169,7 +169,6 @@ def run_job(
     until_s: float,
 ) -> dict[str, Any]:
     """Print up to `most` layers beyond layer `after`, with a look after every few."""
-    model = told.scanner(scanner_name)
     began = time.perf_counter()
     setup = load_setup()
     job = job_of(name, setup)
@@ -188,21 +187,8 @@ def run_job(
         thermal=told.thermal.model_copy(update={"curl_per_mm": curl}),
         middle_mm=centre,
     )
-    pose = seeded_pose(
-        rng,
-        centre_mm=centre,
-        model=model,
-    )
-    scanner = SimulatedScanner(
-        world,
-        pose=pose,
-        sensors_mm=default_sensors_mm(
-            centre,
-            distance_mm=max(300.0, 2 * float(high[2]) + 100),
-            oblique=model.oblique_views,
-        ),
-        rng=rng,
-        model=model,
+    scanner = SimulatedScanner.seeded(
+        world, told, scanner_name, centre_mm=centre, high_mm=float(high[2]), rng=rng
     )
     last = min(len(job.layers) - 1, after + most)
     flow_rng = np.random.default_rng([seed, len(name), 1])

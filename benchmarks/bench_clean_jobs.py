@@ -46,7 +46,7 @@ from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
-from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
+from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from amrepair.template import MeshSdf, load_mesh
 from gcode.moves import Program
@@ -217,25 +217,9 @@ def scans_of(
         thermal=told.thermal.model_copy(update={"curl_per_mm": curl}),
         middle_mm=CENTRE_MM,
     )
-    model = told.scanner(scanner_name)
     rng, flow_rng = np.random.default_rng([seed, 2]), np.random.default_rng([seed, 3])
-    pose = seeded_pose(
-        rng,
-        centre_mm=CENTRE_MM,
-        model=model,
-    )
-    sensors_mm = default_sensors_mm(
-        CENTRE_MM,
-        distance_mm=max(300.0, 2 * float(high[2]) + 100.0),
-        oblique=model.oblique_views,
-    )
-    scanner = SimulatedScanner(
-        world,
-        pose=pose,
-        sensors_mm=sensors_mm,
-        rng=rng,
-        model=model,
-        recording=told.recording(scanner_name),
+    scanner = SimulatedScanner.seeded(
+        world, told, scanner_name, centre_mm=CENTRE_MM, high_mm=float(high[2]), rng=rng
     )
     done = -1
     for stop in stops:

@@ -391,8 +391,8 @@ def _hangs(
         return False
     place_mm = np.asarray(piece.to_mesh64().vert_properties)[:, :3]
     place_mm = place_mm[place_mm[:, 2] >= box_of_solid(piece)[:, 2].mean()]
-    levels = np.arange(1, options.sag_levels + 1) * (options.sag_mm / options.sag_levels)
-    above = place_mm[:, None] + levels[:, None] * np.array([0.0, 0.0, 1.0])
+    levels_mm = np.linspace(0.0, options.sag_mm, options.sag_levels + 1)[1:]
+    above = place_mm[:, None] + levels_mm[:, None] * np.array([0.0, 0.0, 1.0])
     inside = site.template.distance(
         plan.build_from_template.inverse().apply(above.reshape(-1, 3))
     ).reshape(above.shape[:2])

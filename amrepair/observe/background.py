@@ -31,8 +31,9 @@ def background(
         beside = in_plane & (f_mm > max(rim_mm, options.band_mm / 2))
         return np.asarray((f_mm > options.most_excess_mm) | beside)
     band_mm = max(options.band_mm, options.noise_sigmas * scan.sigma_mm)
-    bed = (scan.points_mm[:, 2] < low_z + band_mm) & (f_mm > band_mm / 2)
-    bed |= _of_bed(scan.points_mm, low_z, f_mm > band_mm / 2, band_mm, options)
+    off = f_mm > band_mm / 2
+    bed = off & (scan.points_mm[:, 2] < low_z + band_mm)
+    bed |= _of_bed(scan.points_mm, low_z, off, band_mm, options)
     inside_band = scan.points_mm[:, 2] > low_z - band_mm
     # below the part there is no print; a whole-part scan has its own underside at f ≈ 0
     return bed | (f_mm > options.most_excess_mm) | (~inside_band & (f_mm > options.below_mm))

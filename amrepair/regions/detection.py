@@ -99,9 +99,9 @@ def detect(
     held = "told" if top_z_mm is not None else pose
     seen, sites, nuisance, contradicting = agreed(observe, held, options)
     progress("detect", 1.0, 4.0)
-    by, test = _tested(seen, sites, options, calibration)
+    test = _tested(seen, sites, options, calibration)
     progress("detect", 2.0, 4.0)
-    evidence, surface_label = _bounded(seen, test, options, by)
+    evidence, surface_label = _bounded(seen, test, options)
     progress("detect", 3.0, 4.0)
     regions = find_regions(evidence, test, seen.surface_mm, surface_label, template)
     score = np.abs(seen.f_mm)
@@ -129,16 +129,16 @@ def detect(
         noise=test.noise,
         nuisance=nuisance,
         contradicting=contradicting,
-        calibration=by,
+        calibration=test.calibration,
         options=options,
-        erratic=by != calibration or _erratic(test.levels, options),
+        erratic=test.calibration != calibration or _erratic(test.levels, options),
     )
 
 
 def _tested(
     seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
-) -> tuple[Calibration | None, Tested]:
-    """What each scale was tested by, and regions grown from where it is significant."""
+) -> Tested:
+    """Test every scale, and grow regions from where it is significant."""
     cells, crossed = slice(len(seen.surfels)), slice(len(seen.surfels), None)
     levels = tested(sites, options, calibration)
     if calibration == NORMAL_NOISE and _erratic(levels, options):  # the scan itself contradicts
@@ -158,8 +158,9 @@ def _tested(
     gone_p_value[seen.crossed.which] = np.exp(log_p[0, crossed])
     errors = as_student(levels[1].quantile, levels[1].freedom)
     noise_mm = float(np.median(errors * levels[1].error_mm))
-    return calibration, Tested(
+    return Tested(
         levels,
+        calibration,
         noise=noise_of(levels, seen.shares, seen.scan.sigma_mm, options),
         missing=labels[0, cells],
         excess=labels[1, cells],
@@ -181,9 +182,7 @@ def _erratic(levels: tuple[Level, ...], options: RegionOptions) -> bool:
     return min(low, high) > 0 and low + high >= 2 * RANK
 
 
-def _bounded(
-    seen: Observed, test: Tested, options: RegionOptions, calibration: Calibration | None
-) -> tuple[Evidence, Numbers]:
+def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evidence, Numbers]:
     """What is known of the space around regions, and of each place of the template's surface."""
     labelled = test.missing | test.excess
     evidence = gather(
@@ -192,7 +191,7 @@ def _bounded(
         seen.surfels,
         labelled,
         seen.images,
-        threshold_mm=min(_stray_limit_mm(test.levels[0], options, calibration), test.limit_mm),
+        threshold_mm=min(_stray_limit_mm(test, options), test.limit_mm),
         options=options.evidence,
     )
     surface_label = _label_surface(seen, evidence, test)
@@ -235,14 +234,15 @@ def _strands(
     )
 
 
-def _stray_limit_mm(level: Level, options: RegionOptions, calibration: Calibration | None) -> float:
+def _stray_limit_mm(test: Tested, options: RegionOptions) -> float:
     """How far from the template a cell is broken off: beyond δ's share, and how cells stray.
 
     Of all cells as many stray farther from their neighbours as of normal noise lie beyond
     `grow_sigmas`: the tail of a real scanner's errors counts.
     """
+    level = test.levels[0]
     tolerance_mm = options.grow_share * float(np.median(level.tolerance_mm[0]))
-    if calibration is not None:
+    if test.calibration is not None:
         return tolerance_mm + options.grow_sigmas * float(np.median(level.error_mm))
     stray_mm = np.abs(level.scale.value_mm - level.scale.median_mm)
     share = 1.0 - 2.0 * float(ndtr(-options.grow_sigmas))

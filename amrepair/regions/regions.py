@@ -15,6 +15,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points, touching_mm
 from amrepair.frames import box_of
 from amrepair.regions.anomaly import DefectType, Label, Region
+from amrepair.regions.calibration import Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.significance import Level
 from amrepair.template.port import Template
@@ -29,6 +30,8 @@ class Tested:
 
     Attributes
     ----------
+    calibration
+        What it was judged by: None, by the scan's own errors.
     missing, excess
         (s,) cells of scanned surface that belong to a region.
     gone, gone_p_value
@@ -40,6 +43,7 @@ class Tested:
     """
 
     levels: tuple[Level, ...]
+    calibration: Calibration | None
     noise: Noise
     missing: Mask
     excess: Mask

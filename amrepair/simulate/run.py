@@ -38,7 +38,7 @@ from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.options import USUAL_TRUTH
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
-from amrepair.simulate.scanner import SimulatedScanner, default_sensors_mm, seeded_pose
+from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.stage import DefectTruth, FeltStage, Stage
 from amrepair.simulate.world import World
 from amrepair.template.port import Template
@@ -237,26 +237,14 @@ def set_stage(
     centre = (0.5 * (box[0] + box[3]), 0.5 * (box[1] + box[4]))
     told = world or load_world()
     scanner = DEFAULT_SCANNER if scanner == PROBE else scanner  # it only touches
-    model = told.scanner(scanner)
     standing = World.of(run.setup.printer, told, centre)
     rng = np.random.default_rng([run.seed, 2])
     flow_rng = np.random.default_rng([run.seed, 3])
-    sensors_mm = default_sensors_mm(
-        centre,
-        distance_mm=max(300.0, 2.0 * float(box[5]) + 100.0),
-        oblique=model.oblique_views,
-    )
-    pose = seeded_pose(rng, centre_mm=centre, model=model)
     return Stage(
         standing,
         defects=run.defects,
-        scanner=SimulatedScanner(
-            standing,
-            pose=pose,
-            sensors_mm=sensors_mm,
-            rng=rng,
-            model=model,
-            recording=told.recording(scanner),
+        scanner=SimulatedScanner.seeded(
+            standing, told, scanner, centre_mm=centre, high_mm=float(box[5]), rng=rng
         ),
         take_motion=lambda: noisy_flow(take_motion(), flow_rng, told.flow),
         layer_height_mm=run.setup.process.layer_height_mm,

@@ -22,7 +22,7 @@ from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.columns import IntervalMap
 from amrepair.simulate.options import USUAL_TRUTH
-from amrepair.simulate.parameters import ScannerModel
+from amrepair.simulate.parameters import ScannerModel, WorldParameters
 from amrepair.simulate.recording import Recording
 from amrepair.simulate.replay import Replay
 from amrepair.simulate.scanner_kernels import BED, cast, unhidden
@@ -133,6 +133,40 @@ class SimulatedScanner:
         self._rng = rng
         self.model = model or ScannerModel()
         self._replay = None if recording is None else Replay(recording)
+
+    @classmethod
+    def seeded(
+        cls,
+        world: World,
+        told: WorldParameters,
+        name: str,
+        *,
+        centre_mm: tuple[float, float],
+        high_mm: float,
+        rng: np.random.Generator,
+    ) -> SimulatedScanner:
+        """The scanner of a name, by a seeded pose, far enough over what may stand `high_mm` high.
+
+        A recorded one replays its recording. Parameters as for `seeded_pose`.
+
+        Raises
+        ------
+        InputError
+            If there is none of that name, or the recording cannot be read.
+        """
+        model = told.scanner(name)
+        return cls(
+            world,
+            pose=seeded_pose(rng, centre_mm=centre_mm, model=model),
+            sensors_mm=default_sensors_mm(
+                centre_mm,
+                distance_mm=max(300.0, 2.0 * high_mm + 100.0),
+                oblique=model.oblique_views,
+            ),
+            rng=rng,
+            model=model,
+            recording=told.recording(name),
+        )
 
     def scan(self, request: ScanRequest) -> Scan:
         """Measure what stands on the bed now; points are in the scanner frame.
