@@ -208,7 +208,8 @@ def _evidence_of(
     """
     evidence = anomaly.evidence
     assert evidence is not None
-    if beads is None or anomaly.erratic:
+    # as high as errors reach no line is told
+    if beads is None or anomaly.chance_mm > beads.height_mm.max(initial=0.0):
         return evidence, None, None
     lines, by_rays = skipped(beads, scan, evidence, template, options)
     if not len(lines.width_mm):

@@ -114,8 +114,9 @@ class AnomalyMap:
         stood in), and views that were left out.
     calibration, options
         What stood in for the scan's own word on its errors, and what the test was set to.
-    erratic
-        Errors stand out in many places: a single line of a job is not told from them.
+    chance_mm
+        How far a sound place as wide as the narrowest window may seem to lie below where it is
+        expected, beyond what is allowed: a line of a job that is no higher is not told from errors.
     """
 
     points_mm: Points
@@ -139,7 +140,7 @@ class AnomalyMap:
     contradicting: tuple[Contradiction, ...] = ()
     calibration: Calibration | None = None
     options: RegionOptions | None = None
-    erratic: bool = False
+    chance_mm: float = 0.0
 
     def told(self) -> tuple[str, ...]:
         """What belongs to the whole part or to whole views, or was not judged, in sentences."""

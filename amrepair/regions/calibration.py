@@ -17,7 +17,7 @@ from amrepair.arrays import Values
 from amrepair.errors import InputError
 from gcode.whole import write_bytes
 
-CALIBRATION_VERSION = 2
+CALIBRATION_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +60,9 @@ class Tail:
         return self.start + min(told, self.longest * float(np.log(ratio)))
 
 
+TailTold = tuple[float, float, float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """Errors of sound parts.
@@ -74,33 +77,42 @@ class Calibration:
         (k, c) standard deviation of window means, by width and by how well they were seen, the
         best first.
     tails
-        (statistic, side) → start, scale, peaks a window and peaks in all; statistic 0 is of three
-        cells together, 1 of window medians; side 0 missing, 1 excess.
+        Of three cells together, then of window medians by width: for side 0, missing, and 1,
+        excess, start, scale, peaks a window and peaks in all. In wide windows errors that lie far
+        off at one place fall out.
     """
 
     name: str
     scans: int
     width_mm: tuple[float, ...] = ()
     wander_mm: tuple[tuple[float, ...], ...] = ()
-    tails: tuple[tuple[float, float, float, float], ...] = ()
+    tails: tuple[tuple[TailTold, TailTold], ...] = ()
 
     def wander(self, width_mm: float, classes: int) -> Values:
         """(c,) standard deviation of means of windows so wide, by class; 0 where none is known."""
         if not self.width_mm:
             return np.zeros(classes)
-        nearest = int(np.argmin(np.abs(np.log(np.array(self.width_mm) / width_mm))))
-        known = np.array(self.wander_mm[nearest])
+        known = np.array(self.wander_mm[self._nearest(width_mm)])
         return np.asarray(known[np.minimum(np.arange(classes), len(known) - 1)])
 
-    def tail(self, statistic: int, side: int, windows: int) -> Tail:
-        """How the peaks of so many windows fall off."""
+    def tail(self, width_mm: float | None, side: int, windows: int) -> Tail:
+        """How the peaks of so many windows fall off; without a width, of three cells together."""
         if not self.tails:
             return Tail(0.0, 0.0, 0.0, 0.0)
-        start, scale, rate, told_by = self.tails[2 * statistic + side]
+        row = 0 if width_mm is None else 1 + self._nearest(width_mm)
+        start, scale, rate, told_by = self.tails[row][side]
         return Tail(start, scale, rate * windows, told_by)
+
+    def _nearest(self, width_mm: float) -> int:
+        """The width that is known and most alike."""
+        return int(np.argmin(np.abs(np.log(np.array(self.width_mm) / width_mm))))
 
     def told(self) -> str:
         """Whose errors they are, in a sentence."""
+        if self.name == BED_BESIDE:
+            return (
+                f"Judged by what this scan shows of {BED_BESIDE}: its errors are not normal noise."
+            )
         scans = f"{self.scans} sound scan{'' if self.scans == 1 else 's'}"
         return f"Judged by what {scans} left ('{self.name}')."
 
@@ -162,6 +174,8 @@ def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
     return Calibration("repeated touches", 1, (1.0,), ((wander_mm,),))
 
 
+# What an own calibration of a scan by the bed in it is called.
+BED_BESIDE = "the bed beside the part"
 # Independent normal errors and nothing else: what the simulated scanner leaves by default.
 NORMAL_NOISE = Calibration("normal noise", 0)
 

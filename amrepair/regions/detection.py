@@ -131,7 +131,7 @@ def detect(
         contradicting=contradicting,
         calibration=test.calibration,
         options=options,
-        erratic=test.calibration != calibration or _erratic(test.levels, options),
+        chance_mm=_chance_mm(test, calibration, options),
     )
 
 
@@ -180,6 +180,15 @@ def _erratic(levels: tuple[Level, ...], options: RegionOptions) -> bool:
     """
     low, high = (int((peaks > options.grow_sigmas).sum()) for peaks in levels[0].peaks)
     return min(low, high) > 0 and low + high >= 2 * RANK
+
+
+def _chance_mm(test: Tested, given: Calibration | None, options: RegionOptions) -> float:
+    """How low a sound place may seem to lie by chance; anything, where errors tell no limit."""
+    if test.calibration != given or _erratic(test.levels, options):
+        return np.inf
+    first = test.levels[1]
+    errors = as_student(float(first.critical[0]), first.freedom)
+    return float(np.median(errors * first.error_mm))
 
 
 def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evidence, Numbers]:

@@ -343,7 +343,7 @@ def _level(
         tail = (
             _tail(peaks[side], options)
             if calibration is None
-            else calibration.tail(statistic, side, len(scale))
+            else calibration.tail(3.0 * scale.cell_mm if statistic else None, side, len(scale))
         )
         tails.append(tail)
         safe = np.clip(z[side], 0.0, MOST_ERRORS)

@@ -24,11 +24,13 @@ from amrepair.deficit import (
     with_what_stands_out,
 )
 from amrepair.deficit.options import DeficitOptions
-from amrepair.frames import Transform
+from amrepair.frames import Transform, box_corners, box_of
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
-from amrepair.regions.calibration import of_touches
-from amrepair.regions.sites import PoseKnown
+from amrepair.regions.bed import of_bed
+from amrepair.regions.calibration import NORMAL_NOISE, of_touches
+from amrepair.regions.options import RegionOptions
+from amrepair.regions.sites import PoseKnown, tolerances
 from amrepair.repair import in_view
 from amrepair.repair.alike import registration_of_damage
 from amrepair.repair.filling import fillable, lines_of
@@ -101,6 +103,8 @@ def plan_repair(
         site = replace(site, calibration=of_touches(scan.sigma_mm, site.process_sigma_mm))
     with watch("align"):
         laid = _align(scan, site, guess, rng, progress)
+    with watch("detect"):
+        site = _by_the_bed(laid, site)
     anomaly, deficit = _judge(laid, site, watch, progress)
     chosen = registration_of_damage(scan, site, laid.registration, deficit)
     if chosen is not laid.registration:
@@ -216,6 +220,19 @@ def _align(
     )
 
 
+def _by_the_bed(laid: _Laid, site: Site) -> Site:
+    """Where nobody has told of the scanner's errors, the bed that is scanned with a part does."""
+    if site.calibration != NORMAL_NOISE:
+        return site
+    found = of_bed(
+        laid.whole.moved(laid.placed),
+        box_of(laid.placed.apply(box_corners(site.template.bounds_mm))),
+        tolerances(_region_options(site), site.expected)[0],
+        _region_options(site),
+    )
+    return site if found is None else replace(site, calibration=found)
+
+
 def _judge(
     laid: _Laid, site: Site, watch: Stopwatch, progress: Progress
 ) -> tuple[AnomalyMap, Deficit]:
@@ -231,11 +248,7 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
     return site.detector(
         laid.judged,
         site.expected,
-        options=replace(
-            site.options.regions,
-            allowance_mm=site.allowance_mm,
-            process_sigma_mm=site.process_sigma_mm,
-        ),
+        options=_region_options(site),
         calibration=site.calibration,
         top_z_mm=in_view.top_of_layer(site),
         images=laid.images,
@@ -243,6 +256,15 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
         pose=laid.pose,
         off_by_job=in_view.off_by_job(site, laid.placed),
         progress=progress,
+    )
+
+
+def _region_options(site: Site) -> RegionOptions:
+    """What regions are tested by here."""
+    return replace(
+        site.options.regions,
+        allowance_mm=site.allowance_mm,
+        process_sigma_mm=site.process_sigma_mm,
     )
 
 

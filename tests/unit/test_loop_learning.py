@@ -109,7 +109,7 @@ def test_normal_noise_is_told_and_changes_nothing(small: Small, tmp_path: Path) 
 
 
 def test_a_calibration_that_somebody_named_goes_before(small: Small, tmp_path: Path) -> None:
-    given = Calibration("bench", 4, (3.0,), ((0.08, 0.1),), ((1.0, 0.2, 0.001, 9.0),) * 4)
+    given = Calibration("bench", 4, (3.0,), ((0.08, 0.1),), (((1.0, 0.2, 0.001, 9.0),) * 2,) * 2)
     report, _, _ = _run(small, tmp_path, HIGH_MM, given)
     assert report.calibration == given
     assert {look.plan.anomaly.calibration for look in report.looks} == {given}

@@ -64,7 +64,7 @@ def test_errors_that_hang_together_raise_no_alarm(ball: AnalyticTemplate, seed: 
     scan = rough(ball, seed)
     assert detect(scan, ball).regions == ()
     found = detect(scan, ball, calibration=NORMAL_NOISE, pose="told")
-    assert (found.regions, found.calibration, found.erratic) == ((), None, True)
+    assert (found.regions, found.calibration, found.chance_mm) == ((), None, np.inf)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -1,0 +1,129 @@
+"""The bed beside a part: a plane that nothing lies below, by which a scan tells its own errors.
+
+What a scan shows of a part may be errors or defects. What it shows under the bed can only be
+errors, and the bed is seen in the same scan, by the same sensor, as well as the part is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from amrepair.arrays import Box, Mask, Points
+from amrepair.field.fused import make_surfels
+from amrepair.frames import cells_of
+from amrepair.observe.incidence import incidence
+from amrepair.observe.nuisance import fit_nuisance
+from amrepair.observe.options import BackgroundOptions
+from amrepair.regions.calibrating import NO_TAIL, calibrated
+from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.options import RegionOptions
+from amrepair.regions.significance import Level, tested
+from amrepair.regions.sites import Sites
+from amrepair.scans import Scan
+from amrepair.scans.range_grid import FLYING
+
+UP = np.array([0.0, 0.0, 1.0])
+APART_CELLS = 2  # beside what stands: its foot, and what rays passed over its rim
+
+
+def of_bed(
+    scan: Scan, part_mm: Box, tolerance_mm: float, options: RegionOptions
+) -> Calibration | None:
+    """What the bed beside a part tells of a scan's errors; None where too little of it is seen.
+
+    Parameters
+    ----------
+    scan
+        In the build frame, the bed at z = 0 to what a calibration of the scanner may be off.
+    part_mm
+        Box around the part.
+    tolerance_mm
+        δ, as the part is tested by.
+
+    Returns
+    -------
+    Calibration
+        How far window means wander and how what lies too low falls off, for too low and too high
+        alike; `NORMAL_NOISE` where there is neither.
+    """
+    levels = _levels(scan, part_mm, tolerance_mm, options)
+    if levels is None:
+        return None
+    found = calibrated(BED_BESIDE, (levels,))
+    # the process leaves nothing there: of a part the test takes so much out
+    process_mm = options.process_sigma_mm
+    usual = all(
+        level.errors.wander_mm[0] <= np.hypot(process_mm, np.median(level.errors.window_mm))
+        for level in levels[1:]
+    )
+    if usual and all(low == NO_TAIL for low, _ in found.tails):
+        return NORMAL_NOISE
+    return replace(
+        found,
+        wander_mm=tuple(tuple(np.hypot(w, process_mm).tolist()) for w in found.wander_mm),
+        # on the bed lies what a skirt, a brim or a nozzle left there; below it nothing does
+        tails=tuple((low, low) for low, _ in found.tails),
+    )
+
+
+def _levels(
+    scan: Scan, part_mm: Box, tolerance_mm: float, options: RegionOptions
+) -> tuple[Level, ...] | None:
+    """The bed's tested scales: heights over a plane that is fitted, and bowed."""
+    chosen = _beside(scan.points_mm, part_mm, 0.5 * options.far_mm, options.background)
+    if scan.edge is not None:
+        chosen &= scan.edge & FLYING == 0
+    if not chosen.any():
+        return None
+    bed = scan.subset(chosen)
+    every = np.ones(len(bed), bool)
+    surfels = make_surfels(bed, bed.points_mm[:, 2], every, options.surfels)
+    n = len(surfels)
+    # narrower than errors are told over, and too few places for that
+    if n < options.least_cells or n * surfels.cell_mm**2 < options.far_mm**2:
+        return None
+    normal = np.tile(UP, (n, 1))
+    found = fit_nuisance(
+        surfels.place_mm,
+        normal,
+        surfels.deviation_mm,
+        surfels.count.astype(np.float64),
+        view=None,
+        tolerance_mm=tolerance_mm,
+        correlation_mm=options.correlation_mm,
+    )
+    sites = Sites(
+        cells=n,
+        cell_mm=surfels.cell_mm,
+        place_mm=surfels.place_mm,
+        normal=normal,
+        value_mm=surfels.deviation_mm - found.removed_mm(surfels.place_mm, normal, None),
+        weight=surfels.count.astype(np.float64),
+        tolerance_mm=np.full((2, n), tolerance_mm),
+        facing=incidence(normal, surfels.toward_sensors(np.arange(n))),
+        pose_mm=np.zeros(n),
+    )
+    return tested(sites, replace(options, process_sigma_mm=0.0), None)
+
+
+def _beside(points_mm: Points, part_mm: Box, reach_mm: float, options: BackgroundOptions) -> Mask:
+    """Points of the bed that lie so near to the part, and nothing stands there or beside."""
+    apart_mm = APART_CELLS * options.bed_cell_mm
+    xy_mm = points_mm[:, :2]
+    low_mm, high_mm = part_mm[0, :2] - reach_mm, part_mm[1, :2] + reach_mm
+    near = ((xy_mm > low_mm) & (xy_mm < high_mm)).all(axis=1)
+    # of a part that is no higher as yet the foot, too
+    foot_mm = part_mm[0, :2] - apart_mm, part_mm[1, :2] + apart_mm
+    near &= ~((xy_mm > foot_mm[0]) & (xy_mm < foot_mm[1])).all(axis=1)
+    found = np.zeros(len(points_mm), bool)
+    which = np.flatnonzero(near)
+    cell = cells_of(xy_mm[which], low_mm, options.bed_cell_mm)
+    stands = np.zeros(tuple(cells_of(high_mm[None], low_mm, options.bed_cell_mm)[0] + 1), bool)
+    height_mm = points_mm[which, 2]
+    stands[tuple(cell[height_mm > options.below_mm].T)] = True
+    stands = ndimage.binary_dilation(stands, iterations=APART_CELLS)
+    found[which] = ~stands[tuple(cell.T)] & (np.abs(height_mm) < options.below_mm)
+    return found
