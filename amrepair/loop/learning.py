@@ -1,6 +1,7 @@
 """What a run learns of its scanner from its own first clean layers.
 
-Until then, and where errors turn out to be normal, looks are judged by normal noise. A calibration
+Until then, and where errors turn out to be normal, looks are judged by normal noise; where the bed
+beside the part says otherwise, every look by its own bed, and nothing is learned. A calibration
 that somebody named goes before all of that.
 """
 
@@ -14,7 +15,7 @@ import numpy as np
 from amrepair.loop.looks import Stop
 from amrepair.policy.table import Action, Decision
 from amrepair.regions.calibrating import calibrated
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.regions.detection import judged_levels
 from amrepair.regions.significance import Level
 from amrepair.repair import RepairPlan, Site
@@ -46,6 +47,9 @@ class Learning:
     def note(self, stop: Stop, plan: RepairPlan, decision: Decision) -> Calibration | None:
         """Learn from a look, if its layer is clean; what was learned, once that is enough."""
         clean = decision.action is Action.GO_ON and not plan.anomaly.regions
+        by = plan.anomaly.calibration
+        if by is not None and by.name == BED_BESIDE:  # every look tells of itself
+            return None
         if self._done or not clean or stop.layer_index is None:
             return None
         self._seen.append(judged_levels(plan.anomaly))

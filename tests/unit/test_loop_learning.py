@@ -19,7 +19,7 @@ from amrepair.loop.learning import FIRST_LOOKS, OWN_CALIBRATION, told
 from amrepair.loop.replay import replay
 from amrepair.loop.setting import Setting, keep, open_run
 from amrepair.loop.sites import sites
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.repair import Site
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan, ScanRequest
@@ -61,7 +61,11 @@ def _scans(small: Small, wave_mm: float) -> Callable[[ScanRequest], Scan]:
 
 
 def _run(
-    small: Small, folder: Path, wave_mm: float, given: Calibration | None = None
+    small: Small,
+    folder: Path,
+    wave_mm: float,
+    given: Calibration | None = None,
+    scans: Callable[[ScanRequest], Scan] | None = None,
 ) -> tuple[LoopReport, tuple[Stop, ...], list[str]]:
     stops = plan_stops(small.job, LAYERS, final=False)
     setting = Setting.of(
@@ -73,7 +77,7 @@ def _run(
     keep(folder, setting, small.job.program.text, small.template)
     said: list[str] = []
     report, _ = small.run(
-        folder, _scans(small, wave_mm), stops=stops, tape=Tape(folder), calibration=given,
+        folder, scans or _scans(small, wave_mm), stops=stops, tape=Tape(folder), calibration=given,
         look=RunFolder(folder).record, progress=lambda stage, done, total: said.append(stage),
     )  # fmt: skip
     return report, stops, said
@@ -106,6 +110,35 @@ def test_normal_noise_is_told_and_changes_nothing(small: Small, tmp_path: Path) 
     assert {look.plan.anomaly.calibration for look in report.looks} == {NORMAL_NOISE}
     assert "normal noise" in told(NORMAL_NOISE)
     assert sum(e["event"] == "learned" for e in _events(tmp_path)) == 1
+
+
+def test_where_the_bed_tells_long_tails_each_look_is_judged_by_it(
+    small: Small, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    sound = _scans(small, 0.0)
+
+    def with_bed(request: ScanRequest) -> Scan:
+        """Patches of 1.5 mm of the bed lie up to a millimetre too low."""
+        seen = sound(request)
+        xy = rng.uniform(-15.0, 35.0, (40_000, 2))
+        low = rng.exponential(0.25, (40, 40)) * (rng.random((40, 40)) < 0.1)
+        cell = ((xy + 15.0) / 1.5).astype(int)
+        z = rng.normal(0.0, 0.02, len(xy)) - low[tuple(cell.T)]
+        points = np.column_stack([xy + np.array([100.0, 90.0]), z])
+        normals = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
+        return Scan(
+            np.concatenate([seen.points_mm, points]), seen.sigma_mm, "scanner",
+            np.concatenate([np.asarray(seen.normals), normals]),
+        )  # fmt: skip
+
+    report, _, _ = _run(small, tmp_path, 0.0, scans=with_bed)
+    by = [look.plan.anomaly.calibration for look in report.looks]
+    assert {one.name for one in by if one is not None} == {BED_BESIDE}
+    assert len(set(by)) == len(LAYERS)  # each its own
+    assert report.calibration is None
+    assert any(BED_BESIDE in word for word in report.looks[0].plan.anomaly.told())
+    assert all(not one.differences for one in replay(tmp_path))
 
 
 def test_a_calibration_that_somebody_named_goes_before(small: Small, tmp_path: Path) -> None:
