@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from amrepair.arrays import Box, Mask, Points
 from amrepair.field.fused import make_surfels
-from amrepair.frames import cells_of
+from amrepair.frames import cells_of, in_box
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import fit_nuisance
 from amrepair.observe.options import BackgroundOptions
@@ -26,6 +26,8 @@ from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
 
 UP = np.array([0.0, 0.0, 1.0])
+# Pairs of these tell the wander to a tenth: enough to tell whether it is usual.
+MOST_WINDOWS = 1000
 APART_CELLS = 2  # beside what stands: its foot, and what rays passed over its rim
 
 
@@ -106,21 +108,19 @@ def _levels(
         facing=incidence(normal, surfels.toward_sensors(np.arange(n))),
         pose_mm=np.zeros(n),
     )
-    return tested(sites, replace(options, process_sigma_mm=0.0), None)
+    return tested(sites, replace(options, process_sigma_mm=0.0, most_windows=MOST_WINDOWS), None)
 
 
 def _beside(points_mm: Points, part_mm: Box, reach_mm: float, options: BackgroundOptions) -> Mask:
     """Points of the bed that lie so near to the part, and nothing stands there or beside."""
     apart_mm = APART_CELLS * options.bed_cell_mm
-    xy_mm = points_mm[:, :2]
     low_mm, high_mm = part_mm[0, :2] - reach_mm, part_mm[1, :2] + reach_mm
-    near = ((xy_mm > low_mm) & (xy_mm < high_mm)).all(axis=1)
-    # of a part that is no higher as yet the foot, too
-    foot_mm = part_mm[0, :2] - apart_mm, part_mm[1, :2] + apart_mm
-    near &= ~((xy_mm > foot_mm[0]) & (xy_mm < foot_mm[1])).all(axis=1)
-    found = np.zeros(len(points_mm), bool)
+    near = in_box(points_mm[:, :2], low_mm, high_mm)
+    # of a part that is no higher as yet the foot is none of the bed, too
+    near &= ~in_box(points_mm[:, :2], part_mm[0, :2] - apart_mm, part_mm[1, :2] + apart_mm)
     which = np.flatnonzero(near)
-    cell = cells_of(xy_mm[which], low_mm, options.bed_cell_mm)
+    found = np.zeros(len(points_mm), bool)
+    cell = cells_of(points_mm[which, :2], low_mm, options.bed_cell_mm)
     stands = np.zeros(tuple(cells_of(high_mm[None], low_mm, options.bed_cell_mm)[0] + 1), bool)
     height_mm = points_mm[which, 2]
     stands[tuple(cell[height_mm > options.below_mm].T)] = True
