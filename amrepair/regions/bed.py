@@ -28,7 +28,7 @@ from amrepair.scans.range_grid import FLYING
 UP = np.array([0.0, 0.0, 1.0])
 # Pairs of these tell the wander to a tenth: enough to tell whether it is usual.
 MOST_WINDOWS = 1000
-APART_CELLS = 2  # beside what stands: its foot, and what rays passed over its rim
+APART_CELLS = 1  # beside what stands: its foot
 
 
 def of_bed(
@@ -75,7 +75,7 @@ def _levels(
     scan: Scan, part_mm: Box, tolerance_mm: float, options: RegionOptions
 ) -> tuple[Level, ...] | None:
     """The bed's tested scales: heights over a plane that is fitted, and bowed."""
-    chosen = _beside(scan.points_mm, part_mm, 0.5 * options.far_mm, options.background)
+    chosen = _beside(scan.points_mm, part_mm, options.far_mm, options.background)
     if scan.edge is not None:
         chosen &= scan.edge & FLYING == 0
     if not chosen.any():
@@ -84,8 +84,8 @@ def _levels(
     every = np.ones(len(bed), bool)
     surfels = make_surfels(bed, bed.points_mm[:, 2], every, options.surfels)
     n = len(surfels)
-    # narrower than errors are told over, and too few places for that
-    if n < options.least_cells or n * surfels.cell_mm**2 < options.far_mm**2:
+    # narrower than windows are apart that tell by how much errors wander
+    if n < options.least_cells or n * surfels.cell_mm**2 < (0.5 * options.far_mm) ** 2:
         return None
     normal = np.tile(UP, (n, 1))
     found = fit_nuisance(

@@ -39,30 +39,37 @@ def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
         whole = [np.append(t, np.full(classes - len(t), t[-1])) for t in found]
         mean = np.sqrt(np.square(whole).mean(axis=0))
         wander.append(tuple(float(v) for v in np.maximum.accumulate(mean)))
-    tails = [_tails([levels[0] for levels in scans], (NO_TAIL, NO_TAIL))]
+    alike = [[levels[0] for levels in scans]]
     for width_mm in sorted(widths):
-        alike = [
-            level
-            for levels in scans
-            for level in levels[1:]
-            if abs(np.log2(3.0 * level.scale.cell_mm / width_mm)) <= ALIKE_OCTAVES
-        ]
-        tails.append(_tails(alike, tails[-1]))
-    return Calibration(name, len(scans), tuple(sorted(widths)), tuple(wander), tuple(tails))
+        alike.append(
+            [
+                level
+                for levels in scans
+                for level in levels[1:]
+                if abs(np.log2(3.0 * level.scale.cell_mm / width_mm)) <= ALIKE_OCTAVES
+            ]
+        )
+    sides = (_tails(alike, 0), _tails(alike, 1))
+    tails = tuple(zip(*sides, strict=True))
+    return Calibration(name, len(scans), tuple(sorted(widths)), tuple(wander), tails)
 
 
-def _tails(
-    levels: Sequence[Level], narrower: tuple[TailTold, TailTold]
-) -> tuple[TailTold, TailTold]:
-    """How peaks fall off, too low and too high; too few of them do so as in narrower windows."""
-    windows = sum(len(level.scale) for level in levels)
-    found = []
-    for side in (0, 1):
+def _tails(alike: Sequence[Sequence[Level]], side: int) -> list[TailTold]:
+    """How peaks to one side fall off, of three cells together and then by rising width.
+
+    Where they are too few to tell, they do so as in the next narrower windows, if those tell: what
+    lies far off there may reach into these, so that one at least is taken to.
+    """
+    found: list[TailTold] = []
+    lent = (0.0, 0.0)
+    for k, levels in enumerate(alike):
         peaks = np.concatenate([level.peaks[side] for level in levels])
-        start, scale, _, told_by = narrower[side]
-        if len(peaks) >= 2 * RANK:
-            start = levels[0].tails[side].start
-            scale, told_by = float(peaks.mean() - start), float(len(peaks))
-        told = len(peaks) > 0 and scale > 0.0
-        found.append((start, scale, len(peaks) / windows, told_by) if told else NO_TAIL)
-    return found[0], found[1]
+        start = levels[0].tails[side].start
+        tells = len(peaks) >= 2 * RANK
+        own = float(peaks.mean() - start) if tells else 0.0, float(len(peaks))
+        scale, told_by = own if tells else lent
+        rate = max(len(peaks), 1) / sum(len(level.scale) for level in levels)
+        found.append((start, scale, rate, told_by) if scale else NO_TAIL)
+        if tells or k > 1:  # three cells together are as wide as the narrowest windows
+            lent = own
+    return found

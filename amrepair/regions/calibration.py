@@ -51,11 +51,11 @@ class Tail:
         falls = np.maximum(
             self.told_by * np.log1p(beyond / (self.told_by * self.scale)), beyond / self.longest
         )
-        return np.asarray(np.log(max(self.peaks, 1.0)) - falls)
+        return np.asarray(np.log(self.peaks) - falls)
 
     def exceeded_by(self, expected: float) -> float:
         """Beyond which value a scan has so many peaks of sound places."""
-        ratio = max(self.peaks, 1.0) / expected
+        ratio = max(self.peaks / expected, 1.0)
         told = self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
         return self.start + min(told, self.longest * float(np.log(ratio)))
 

@@ -96,7 +96,7 @@ def test_a_part_that_is_as_yet_no_higher_than_the_bed_s_errors_is_none_of_it() -
 
 def test_too_little_of_a_bed_tells_nothing() -> None:
     points = bed(0)
-    strip = np.abs(points[:, 1] + 5.0) < 2.0
+    strip = np.abs(points[:, 1] + 5.0) < 0.7
     assert told(points[strip]) is None
     assert told(points + np.array([200.0, 0.0, 0.0])) is None
 
