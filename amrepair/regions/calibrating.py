@@ -57,8 +57,8 @@ def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
 def _tails(alike: Sequence[Sequence[Level]], side: int) -> list[TailTold]:
     """How peaks to one side fall off, of three cells together and then by rising width.
 
-    Where they are too few to tell, they do so as in the next narrower windows, if those tell: what
-    lies far off there may reach into these, so that one at least is taken to.
+    Where they are too few to tell, windows twice as wide as the narrowest, or as these, take them
+    for as long: what lies far off there may reach into them, so that one at least is taken to.
     """
     found: list[TailTold] = []
     lent = (0.0, 0.0)
@@ -70,6 +70,6 @@ def _tails(alike: Sequence[Sequence[Level]], side: int) -> list[TailTold]:
         scale, told_by = own if tells else lent
         rate = max(len(peaks), 1) / sum(len(level.scale) for level in levels)
         found.append((start, scale, rate, told_by) if scale else NO_TAIL)
-        if tells or k > 1:  # three cells together are as wide as the narrowest windows
-            lent = own
+        # three cells together are as wide as the narrowest windows
+        lent = (0.0, 0.0) if k > 1 else own if tells else lent
     return found
