@@ -21,6 +21,8 @@ class BackgroundOptions:
         Under the bed's band, what lies so far from the part is none of it.
     bed_cell_mm, bed_points
         What lies on the bed is told from it by places so wide, of so many points or more.
+    bed_apart_mm
+        So near to what stands on it the bed is not asked for a scan's errors.
     seen_underside, underside_rim_mm, foot_cell_mm, most_foot
         So much of the underside seen, so far from its rim: nothing lies under the part, there is no
         bed. It is counted in such cells, on so many points.
@@ -32,6 +34,7 @@ class BackgroundOptions:
     below_mm: float = 1.0
     bed_cell_mm: float = 1.0
     bed_points: int = 3
+    bed_apart_mm: float = 1.0
     seen_underside: float = 0.3
     underside_rim_mm: float = 0.15
     foot_cell_mm: float = 1.0

@@ -26,9 +26,6 @@ from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
 
 UP = np.array([0.0, 0.0, 1.0])
-# Pairs of these tell the wander to a tenth: enough to tell whether it is usual.
-MOST_WINDOWS = 1000
-APART_CELLS = 1  # beside what stands: its foot
 
 
 def of_bed(
@@ -108,12 +105,14 @@ def _levels(
         facing=incidence(normal, surfels.toward_sensors(np.arange(n))),
         pose_mm=np.zeros(n),
     )
-    return tested(sites, replace(options, process_sigma_mm=0.0, most_windows=MOST_WINDOWS), None)
+    return tested(
+        sites, replace(options, process_sigma_mm=0.0, most_windows=options.bed_windows), None
+    )
 
 
 def _beside(points_mm: Points, part_mm: Box, reach_mm: float, options: BackgroundOptions) -> Mask:
     """Points of the bed that lie so near to the part, and nothing stands there or beside."""
-    apart_mm = APART_CELLS * options.bed_cell_mm
+    apart_mm = options.bed_apart_mm
     low_mm, high_mm = part_mm[0, :2] - reach_mm, part_mm[1, :2] + reach_mm
     near = in_box(points_mm[:, :2], low_mm, high_mm)
     # of a part that is no higher as yet the foot is none of the bed, too
@@ -124,6 +123,6 @@ def _beside(points_mm: Points, part_mm: Box, reach_mm: float, options: Backgroun
     stands = np.zeros(tuple(cells_of(high_mm[None], low_mm, options.bed_cell_mm)[0] + 1), bool)
     height_mm = points_mm[which, 2]
     stands[tuple(cell[height_mm > options.below_mm].T)] = True
-    stands = ndimage.binary_dilation(stands, iterations=APART_CELLS)
+    stands = ndimage.binary_dilation(stands, iterations=round(apart_mm / options.bed_cell_mm))
     found[which] = ~stands[tuple(cell.T)] & (np.abs(height_mm) < options.below_mm)
     return found

@@ -155,8 +155,9 @@ class RegionOptions:
     least_cells
         Cells from which the noise of a class is told; with fewer it is that of the class below.
         A scan with fewer in all cannot tell its noise: the profile's is used, and named.
-    most_windows
-        So many windows tell by how much means wander: enough for a few per cent.
+    most_windows, bed_windows
+        So many windows tell by how much means wander: enough for a few per cent; of the bed, for a
+        tenth.
     spacing_mm
         Template surface points are asked for so far apart.
     guess_depths
@@ -186,6 +187,7 @@ class RegionOptions:
     seen_step: float = 0.5
     least_cells: int = 30
     most_windows: int = 3000
+    bed_windows: int = 1000
     spacing_mm: float = 0.6
     guess_depths: float = 2.0
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
