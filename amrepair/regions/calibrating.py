@@ -15,7 +15,7 @@ from amrepair.regions.significance import Level
 # Peaks that are too few for it tell no tail.
 NO_TAIL: TailTold = (0.0, 0.0, 0.0, 0.0)
 # Windows are twice as wide from scale to scale: half of that to either side.
-ALIKE_OCTAVES = 0.5
+HALF_OCTAVE = 0.5
 
 
 def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
@@ -39,37 +39,40 @@ def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
         whole = [np.append(t, np.full(classes - len(t), t[-1])) for t in found]
         mean = np.sqrt(np.square(whole).mean(axis=0))
         wander.append(tuple(float(v) for v in np.maximum.accumulate(mean)))
+    known_mm = sorted(widths)
     alike = [[levels[0] for levels in scans]]
-    for width_mm in sorted(widths):
+    for width_mm in known_mm:
         alike.append(
             [
                 level
                 for levels in scans
                 for level in levels[1:]
-                if abs(np.log2(3.0 * level.scale.cell_mm / width_mm)) <= ALIKE_OCTAVES
+                if abs(np.log2(3.0 * level.scale.cell_mm / width_mm)) <= HALF_OCTAVE
             ]
         )
-    sides = (_tails(alike, 0), _tails(alike, 1))
+    # three cells together are as wide as the narrowest windows
+    octave = [0.0, *np.log2(np.array(known_mm) / known_mm[0]).tolist()]
+    sides = (_tails(alike, octave, 0), _tails(alike, octave, 1))
     tails = tuple(zip(*sides, strict=True))
-    return Calibration(name, len(scans), tuple(sorted(widths)), tuple(wander), tails)
+    return Calibration(name, len(scans), tuple(known_mm), tuple(wander), tails)
 
 
-def _tails(alike: Sequence[Sequence[Level]], side: int) -> list[TailTold]:
+def _tails(alike: Sequence[Sequence[Level]], octave: Sequence[float], side: int) -> list[TailTold]:
     """How peaks to one side fall off, of three cells together and then by rising width.
 
-    Where they are too few to tell, windows twice as wide as the narrowest, or as these, take them
-    for as long: what lies far off there may reach into them, so that one at least is taken to.
+    Where they are too few to tell, windows up to twice as wide as the narrowest take after those:
+    what lies far off there may reach into them, so that one peak at least is taken to.
     """
     found: list[TailTold] = []
-    lent = (0.0, 0.0)
-    for k, levels in enumerate(alike):
+    narrowest = (0.0, 0.0)
+    for levels, wider in zip(alike, octave, strict=True):
         peaks = np.concatenate([level.peaks[side] for level in levels])
         start = levels[0].tails[side].start
         tells = len(peaks) >= 2 * RANK
         own = float(peaks.mean() - start) if tells else 0.0, float(len(peaks))
-        scale, told_by = own if tells else lent
+        if tells and wider <= HALF_OCTAVE:
+            narrowest = own
+        scale, told_by = own if tells or wider > 1.0 + HALF_OCTAVE else narrowest
         rate = max(len(peaks), 1) / sum(len(level.scale) for level in levels)
         found.append((start, scale, rate, told_by) if scale else NO_TAIL)
-        # three cells together are as wide as the narrowest windows
-        lent = (0.0, 0.0) if k > 1 else own if tells else lent
     return found
