@@ -18,6 +18,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.arrays import Values
 from amrepair.deficit.boxes import Sought
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
@@ -156,6 +157,7 @@ def compute_deficit(
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
     evidence, lines, by_rays = _evidence_of(scan, template, anomaly, beads, options.skipped)
+    deviation_mm = anomaly.deviation_mm
     look = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
@@ -181,7 +183,9 @@ def compute_deficit(
         if as_built is not None:
             return as_built.standing(seen, missing)
         parts = missing, excess
-        return _standing(seen, scan, template, build_from_template, *parts, evidence, options)
+        return _standing(
+            seen, scan, template, build_from_template, *parts, evidence, deviation_mm, options
+        )
 
     return Deficit(
         missing=missing,
@@ -235,6 +239,7 @@ def _standing(
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
     evidence: Evidence,
+    deviation_mm: Values,
     options: DeficitOptions,
 ) -> HeightField:
     """What stands on the bed: the scan's heights, with the solids' walls and the points' own."""
@@ -242,7 +247,9 @@ def _standing(
     expected = designed.transform(build_from_template.matrix[:3])
     solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess, options.heights)
     points_mm, spacing_mm = build_from_template.apply(scan.points_mm), evidence.spacing_mm
-    sharp = with_sharp_walls(solid, lost_mm > 0, points_mm, scan.sigma_mm, options.walls)
+    sharp = with_sharp_walls(
+        solid, lost_mm > 0, points_mm, scan.sigma_mm, options.walls, deviation_mm=deviation_mm
+    )
     known = with_what_stands_out(sharp, points_mm, scan.sigma_mm, spacing_mm, options.heights)
     return with_rims(known, lost_mm, designed_mm, spacing_mm, options.walls)
 

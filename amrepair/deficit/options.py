@@ -132,6 +132,8 @@ class WallOptions:
         Points so near to a wall's ends, in the scan's noise, belong to what lies above or below it.
     most_spread_sigma
         What lies farther from its plane than noise alone, on average, is more than one wall.
+    inside_sigma
+        A point so far inside the template, in the scan's noise, lies on what broke.
     most_slant
         Cosine: a wall is steeper than 75°.
     crest_cells, crest_reach_cells
@@ -155,6 +157,7 @@ class WallOptions:
     below_top_sigma: float = 2.5
     over_foot_sigma: float = 4.0
     most_spread_sigma: float = 1.75
+    inside_sigma: float = 2.0
     most_slant: float = 0.25
     crest_cells: int = 4
     crest_reach_cells: int = 2

@@ -12,10 +12,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import ndimage
 
-from amrepair.arrays import ColumnMask, HeightMap, Points
+from amrepair.arrays import ColumnMask, HeightMap, Points, Values
 from amrepair.deficit import walls_kernels as kernels
 from amrepair.deficit.options import USUAL_DEFICIT, WallOptions
 from amrepair.frames import cells_of, in_box
@@ -28,6 +28,8 @@ def with_sharp_walls(
     points_mm: Points,
     sigma_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
+    *,
+    deviation_mm: Values | None = None,
 ) -> HeightField:
     """The as-built field, columns beside walls high or low as their middles lie to the wall.
 
@@ -37,6 +39,10 @@ def with_sharp_walls(
         Columns that something is missing from: only walls beside them are looked at.
     points_mm
         What was seen, build frame.
+    deviation_mm
+        How far each lies out of the template, negative inside: what broke lies in it. Between a
+        void and the part's own outside a wall may be thinner than `radius_mm`, and a plane through
+        the points of both its faces is none. None: nobody knows.
     """
     if not gone.any() or sigma_mm <= 0:
         return field
@@ -44,17 +50,26 @@ def with_sharp_walls(
         gone, options.beside_cells + int(np.ceil(options.radius_mm / field.cell_mm))
     )
     z_mm = np.array(field.z_mm, dtype=np.float64)
-    near = z_mm[rows, columns]
-    beside = ndimage.maximum_filter(gone[rows, columns], 2 * options.beside_cells + 1)
-    step_mm = ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(near, 3)
-    iy, ix = map(np.ascontiguousarray, (beside & (step_mm > options.step_mm)).nonzero())
+    near, lost = z_mm[rows, columns], np.ascontiguousarray(gone[rows, columns])
+    beside = ndimage.maximum_filter(lost, 2 * options.beside_cells + 1)
     corner_mm = field.origin_mm + np.array([columns.start, rows.start]) * field.cell_mm
-    sorted_mm, start = _by_cell(points_mm, corner_mm, field.cell_mm, near.shape)
-    near[iy, ix] = kernels.sharpened(
-        near.copy(), iy, ix, start, sorted_mm, corner_mm, field.cell_mm, options.radius_mm,
-        options.below_top_sigma * sigma_mm, options.over_foot_sigma * sigma_mm,
-        options.most_spread_sigma * sigma_mm, options.most_slant,
-    )  # fmt: skip
+    inside = np.zeros(len(points_mm), dtype=bool)
+    if deviation_mm is not None:
+        inside = deviation_mm < -options.inside_sigma * sigma_mm
+    seen, broken = (
+        _by_cell(of, corner_mm, field.cell_mm, near.shape) for of in (points_mm, points_mm[inside])
+    )
+    for _ in range(int(np.ceil(options.radius_mm / field.cell_mm))):  # from the rim in
+        step_mm = ndimage.maximum_filter(near, 3) - ndimage.minimum_filter(near, 3)
+        iy, ix = map(np.ascontiguousarray, (beside & (step_mm > options.step_mm)).nonzero())
+        told_mm = kernels.sharpened(
+            near.copy(), lost, iy, ix, seen, broken, corner_mm, field.cell_mm, options.radius_mm,
+            options.below_top_sigma * sigma_mm, options.over_foot_sigma * sigma_mm,
+            options.most_spread_sigma * sigma_mm, options.most_slant,
+        )  # fmt: skip
+        if np.array_equal(told_mm, near[iy, ix]):
+            break
+        near[iy, ix] = told_mm
     return replace(field, z_mm=z_mm)
 
 
@@ -169,7 +184,7 @@ def window_around(gone: ColumnMask, margin: int) -> tuple[slice, slice]:
 
 def _by_cell(
     points_mm: Points, corner_mm: Float[np.ndarray, " 2"], cell_mm: float, shape: tuple[int, int]
-) -> tuple[Float[np.ndarray, "kept 3"], Int[np.ndarray, "ny nx1"]]:
+) -> kernels.PointsByCell:
     """Points over a grid sorted by its cells, and where those of each cell begin, by row."""
     ny, nx = shape
     high_mm = corner_mm + cell_mm * np.array([nx, ny])
@@ -178,4 +193,4 @@ def _by_cell(
     cell = np.minimum(index[:, 1], ny - 1) * nx + np.minimum(index[:, 0], nx - 1)
     ends = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=ny * nx))])
     start = np.lib.stride_tricks.sliding_window_view(ends, nx + 1)[::nx]
-    return own[np.argsort(cell, kind="stable")], np.ascontiguousarray(start)
+    return kernels.PointsByCell(np.ascontiguousarray(start), own[np.argsort(cell, kind="stable")])

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from gcode.compiled import njit
@@ -17,13 +19,23 @@ STEEPEST_CELL_MM = 0.15
 EVEN_ENDS_MM = 0.03
 
 
+class PointsByCell(NamedTuple):
+    """Points sorted by the cells of a grid: `points` (n, 3), and where those of each cell begin.
+
+    `start` (ny, nx + 1) says that by row. Kernels unpack it.
+    """
+
+    start: Any
+    points: Any
+
+
 @njit(cache=True, nogil=True)
-def plane_of(x, y, iy, ix, high, low, start, points, reach, radius):
+def plane_of(x, y, iy, ix, high, low, cloud, reach, radius):
     """(7,) of the points within a radius and two heights: mean, normal and spread along it.
 
-    `points` (n, 3) are sorted by cell, `start` (ny, nx + 1) says where those of each cell begin.
     Spread is infinite where there are too few, or they are all on one line.
     """
+    start, points = cloud
     ny, nx = start.shape[0], start.shape[1] - 1
     found = np.zeros(7)
     found[6] = np.inf
@@ -55,14 +67,51 @@ def plane_of(x, y, iy, ix, high, low, start, points, reach, radius):
 
 
 @njit(cache=True, nogil=True)
+def ends_around(z, gone, i, j):
+    """Highest and lowest of what stands around a column, and of that the lowest in what is gone."""
+    ny, nx = z.shape
+    high, low, foot = -np.inf, np.inf, np.inf
+    for row in range(max(i - SIDE_CELLS, 0), min(i + SIDE_CELLS + 1, ny)):
+        for column in range(max(j - SIDE_CELLS, 0), min(j + SIDE_CELLS + 1, nx)):
+            if gone[row, column]:
+                foot = min(foot, z[row, column])
+            if max(abs(row - i), abs(column - j)) <= AROUND_CELLS:
+                high, low = max(high, z[row, column]), min(low, z[row, column])
+    return high, low, max(foot, low)
+
+
+@njit(cache=True, nogil=True)
+def way_down(z, gone, i, j, middle, into_gone):
+    """(2,) from what is higher than `middle` around a column to what is lower, columns and rows.
+
+    With `into_gone`, only to that of it which something is missing from; zero where there is none.
+    """
+    ny, nx = z.shape
+    way, count = np.zeros((2, 2)), np.zeros(2)
+    for row in range(max(i - SIDE_CELLS, 0), min(i + SIDE_CELLS + 1, ny)):
+        for column in range(max(j - SIDE_CELLS, 0), min(j + SIDE_CELLS + 1, nx)):
+            side = 1 if z[row, column] > middle else 0
+            if side == 0 and into_gone and not gone[row, column]:
+                continue
+            count[side] += 1
+            way[side, 0] += column
+            way[side, 1] += row
+    if count[0] == 0 or count[1] == 0:
+        return np.zeros(2)
+    return way[0] / count[0] - way[1] / count[1]
+
+
+@njit(cache=True, nogil=True)
 def sharpened(
-    z, iy, ix, start, points, origin, cell, radius, below_top, over_foot, most_spread, most_slant
-):
+    z, gone, iy, ix, seen, broken, origin, cell, radius, below_top, over_foot, most_spread,
+    most_slant,
+):  # fmt: skip
     """(q,) heights of the columns asked about, (q,) `iy` and `ix`.
 
     A column whose middle lies inside the plane of the wall beside it, at its top and at its foot,
     is as high as what stands around; outside, as low. Where a plane through it is upright but for
-    its own error, the wall's middle decides.
+    its own error, the wall's middle decides. `broken` are those of the points `seen` that lie on
+    what broke: of a thin wall both faces are near, and only one of them bounds what is gone.
     """
     ny, nx = z.shape
     out = np.empty(len(iy))
@@ -70,46 +119,38 @@ def sharpened(
     for q in range(len(iy)):
         i, j = iy[q], ix[q]
         out[q] = z[i, j]
-        high, low = -np.inf, np.inf
-        for row in range(max(i - AROUND_CELLS, 0), min(i + AROUND_CELLS + 1, ny)):
-            for column in range(max(j - AROUND_CELLS, 0), min(j + AROUND_CELLS + 1, nx)):
-                high, low = max(high, z[row, column]), min(low, z[row, column])
+        high, low, foot = ends_around(z, gone, i, j)
         x, y = origin[0] + (j + 0.5) * cell, origin[1] + (i + 0.5) * cell
-        plane = plane_of(
-            x, y, i, j, high - below_top, low + over_foot, start, points, reach, radius
-        )
-        if plane[6] > most_spread or abs(plane[5]) > most_slant:
-            continue
-        # from what is high towards what is low
+        top = high - below_top
+        plane = plane_of(x, y, i, j, top, foot + over_foot, broken, reach, radius)
+        is_broken = plane[6] <= most_spread and abs(plane[5]) <= most_slant
+        if is_broken:
+            low = foot
+        else:
+            plane = plane_of(x, y, i, j, top, low + over_foot, seen, reach, radius)
+            if plane[6] > most_spread or abs(plane[5]) > most_slant:
+                continue
         middle = 0.5 * (high + low)
-        way, count = np.zeros((2, 2)), np.zeros(2)
-        for row in range(max(i - SIDE_CELLS, 0), min(i + SIDE_CELLS + 1, ny)):
-            for column in range(max(j - SIDE_CELLS, 0), min(j + SIDE_CELLS + 1, nx)):
-                side = 1 if z[row, column] > middle else 0
-                count[side] += 1
-                way[side, 0] += column
-                way[side, 1] += row
-        if count[0] == 0 or count[1] == 0:
-            continue
-        gx, gy = way[0] / count[0] - way[1] / count[1]
+        gx, gy = way_down(z, gone, i, j, middle, is_broken)
         along = plane[3] * gx + plane[4] * gy
-        if abs(along) < 0.5 * np.hypot(gx, gy):
+        if abs(along) < 0.5 * np.hypot(gx, gy) or along == 0:
             continue
         turn = 1.0 if along > 0 else -1.0
         level = plane[3] * (x - plane[0]) + plane[4] * (y - plane[1])
         at_top = turn * (level + plane[5] * (high - plane[2]))
         at_foot = turn * (level + plane[5] * (low - plane[2]))
         if (at_top > 0) != (at_foot > 0):
-            if max(abs(at_top), abs(at_foot)) > EVEN_ENDS_MM:
+            if not is_broken and max(abs(at_top), abs(at_foot)) > EVEN_ENDS_MM:
                 continue
             at_top = turn * level
-        if (at_top > 0) == (z[i, j] <= middle):
-            continue
+        if (at_top > 0) == (z[i, j] <= middle) or (is_broken and at_top <= 0 and not gone[i, j]):
+            continue  # it is so already; or it lies beyond a thin wall
         found = False
         for row in range(max(i - 1, 0), min(i + 2, ny)):
             for column in range(max(j - 1, 0), min(j + 2, nx)):
-                if (z[row, column] <= middle) == (at_top > 0):
-                    out[q] = max(out[q], z[row, column]) if found else z[row, column]
+                there = z[row, column]
+                if (there <= middle) == (at_top > 0) and there >= low:
+                    out[q] = max(out[q], there) if found else there
                     found = True
         if not found:
             out[q] = low if at_top > 0 else high

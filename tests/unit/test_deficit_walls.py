@@ -98,6 +98,30 @@ def _distance_to_edge(inside: np.ndarray, cell_mm: float) -> np.ndarray:
     return np.asarray(np.maximum(within, without) * cell_mm)
 
 
+def test_a_wall_thinner_than_its_points_reach_is_told_by_its_broken_face() -> None:
+    """Between a pit and the outside: points of both faces lie on no plane, and it read too wide."""
+    block = Solid.cube((24.0, 20.0, 6.0))
+    pit = Solid.cube((9.0, 8.0, 4.0)).translate((7.037, 11.74, 3.0))
+    rest, piece = block - pit, block ^ pit
+    truth = HeightField.from_manifold(rest, CELL_MM, margin_mm=1.0)
+    x, y = truth.centres_mm()
+    thin_mm = 20.0 - 19.74
+    along = (np.abs(x - 11.5) < 3.5)[None, :]
+    wide = along & ((y > 19.74 - 0.35) & (y < 20.0))[:, None]
+    rough = truth.raised(np.where(wide, 6.0, 0.0))
+    points = scanned(rest, 3)
+    # of a block the nearest face tells how far inside a point lies, by each axis
+    deviation_mm = np.maximum(-points, points - (24.0, 20.0, 6.0)).max(axis=1)
+    sharp = with_sharp_walls(
+        rough, gone_from(truth, piece), points, SIGMA_MM, deviation_mm=deviation_mm
+    )
+    surely = along & (np.abs(y - 19.74) > UNDECIDED_MM)[:, None]
+    asked = surely & ((y > 19.0) & (y < 21.0))[:, None]
+    assert thin_mm < OPTIONS.radius_mm
+    assert (asked & (rough.z_mm - truth.z_mm > 0.5)).sum() > 100
+    assert not (asked & (np.abs(sharp.z_mm - truth.z_mm) > 0.5)).any()
+
+
 def test_slopes_and_what_is_not_broken_stay_as_they_are() -> None:
     block = Solid.cube((24.0, 20.0, 6.0))
     wedge = Solid.cube((10.0, 8.0, 6.0), True).rotate((0.0, 40.0, 0.0)).translate((12.0, 10.0, 7.0))
