@@ -14,13 +14,14 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points, Values, VoxelMask, Voxels
 from amrepair.field import cut_kernels as kernels
 from amrepair.field.groups import group_points
 from amrepair.field.near import has_near, nearest_within
 from amrepair.field.options import OccupancyOptions
-from amrepair.frames import box_of, cells_of, diagonal, in_box, unit_vectors
+from amrepair.frames import box_of, cells_of, diagonal, in_box, spread_directions, unit_vectors
 from amrepair.template.port import Template
 
 # Capacities are whole numbers of this share of a nat; none is larger than that many.
@@ -30,6 +31,8 @@ LOOK_VOXELS = (0.75, 1.5, 2.5)
 # Blocks of so many voxels a side whose middle is so many sides from the template's surface are
 # wholly in it or outside it: √3 / 2, and a little.
 TRACED_BLOCK, FAR_BLOCKS = 4, 1.1
+# Ways that surface can face, 9° apart.
+FACED_WAYS = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,14 +184,17 @@ def find_occupancy(
     bare = ~has_near(places_mm, on_mm, options.gap_spacings * spacing_mm)
     box_mm = _box(scan, places_mm[bare])
     grid = _grid(scan, box_mm)
-    unseen = _nats_unseen(normals, scan.sees(places_mm), (grid.voxel_mm / spacing_mm) ** 2, options)
+    seen = scan.sees(places_mm)
+    unseen = _nats_unseen(normals, seen, (grid.voxel_mm / spacing_mm) ** 2, options)
     scan = replace(scan, on_mm=on_mm[in_box(on_mm, *box_mm)])
     facets = _facets(grid)
     nats = unseen[facets.axis] * _unexplained(scan, facets, grid.voxel_mm)[:, None]
     cut = _Cut.of(facets, nats, _told(scan, grid))
     solid = np.zeros(grid.number.shape, bool)
     solid[grid.number >= 0] = ~_with_open_sides(scan, cut, grid)
-    return Occupancy(grid.low_mm, grid.voxel_mm, _as_seen(solid, scan, grid), grid.f_mm < 0)
+    found = _as_seen(solid, scan, grid)
+    found |= _guessed(found, (*surface, seen), scan, grid)
+    return Occupancy(grid.low_mm, grid.voxel_mm, found, grid.f_mm < 0)
 
 
 def _box(scan: _Scanned, bare_mm: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "2 3"]:
@@ -298,15 +304,36 @@ def _nats_unseen(
     The scan saw of the template's surface that faces this way such a share: as probably it would
     have seen this, with as many points as its area holds at the scan's density.
     """
-    nats = np.zeros((3, 2))
-    for axis in range(3):
-        for k, way in enumerate((1.0, -1.0)):
-            cosine = way * normals[:, axis]
-            weight = np.where(cosine > options.way_cosine, cosine**2, 0.0)
-            cover = float((weight * seen).sum() / weight.sum()) if weight.any() else 1.0
-            chance = min(cover, options.largest_cover) * (1.0 - np.exp(-points))
-            nats[axis, k] = -np.log1p(-chance)
-    return nats
+    ways = np.stack([np.eye(3), -np.eye(3)], axis=1).reshape(-1, 3)
+    cover = _cover(ways, normals, np.ones(len(normals)), seen, options)
+    chance = np.minimum(cover, options.largest_cover) * (1.0 - np.exp(-points))
+    return np.asarray(-np.log1p(-chance).reshape(3, 2))
+
+
+def _cover(
+    ways: Points,
+    normals: Float[np.ndarray, "m 3"],
+    every: Float[np.ndarray, " m"],
+    seen: Bool[np.ndarray, " m"] | Float[np.ndarray, " m"],
+    options: OccupancyOptions,
+) -> Values:
+    """(n,) how much was seen of the template's surface that faces about each way.
+
+    `every` and `seen` count places by their normals, of which all and those that were.
+    """
+    cosine = ways @ normals.T
+    weight = np.where(cosine > options.way_cosine, cosine**2, 0.0)
+    whole = weight @ every
+    return np.asarray(np.where(whole > 0, weight @ seen / np.where(whole > 0, whole, 1.0), 1.0))
+
+
+def _hidden(normals: Points, seen: Mask, options: OccupancyOptions) -> Mask:
+    """Places that nobody saw, where most surface that faces as they do was not seen either."""
+    ways = spread_directions(FACED_WAYS)
+    of = cKDTree(ways).query(normals)[1]
+    every, looked = (np.bincount(of, which, FACED_WAYS) for which in (None, seen))
+    cover = _cover(ways, ways, every.astype(np.float64), looked, options)
+    return np.asarray(~seen & (cover[of] < options.hidden_cover))
 
 
 def _unexplained(scan: _Scanned, facets: _Facets, voxel_mm: float) -> Values:
@@ -319,14 +346,18 @@ def _unexplained(scan: _Scanned, facets: _Facets, voxel_mm: float) -> Values:
     f_mm, gradient = scan.template.distance_and_gradient(facets.middle_mm[on])
     feet_mm = facets.middle_mm[on] - f_mm[:, None] * unit_vectors(gradient)
     share[on] = ~scan.sees(feet_mm)
-    # steps of voxels lie beside the surface by up to about half of one
-    width_mm = scan.options.gap_spacings * scan.spacing_mm + 0.6 * voxel_mm
+    width_mm = _width_mm(scan, voxel_mm)
     middle_mm = facets.middle_mm[off]
     nearest = nearest_within(middle_mm, scan.broken.place_mm, 1.4 * width_mm)
     found = nearest >= 0
     apart_mm = np.linalg.norm(middle_mm[found] - scan.broken.place_mm[nearest[found]], axis=1)
     share[off[found]] = -np.expm1(-((apart_mm / width_mm) ** 4))
     return share
+
+
+def _width_mm(scan: _Scanned, voxel_mm: float) -> float:
+    """How far from its points surface may be put; steps of voxels by up to half of one more."""
+    return scan.options.gap_spacings * scan.spacing_mm + 0.6 * voxel_mm
 
 
 def _told(scan: _Scanned, grid: _Grid) -> Float[np.ndarray, " v"]:
@@ -555,6 +586,78 @@ def _as_seen(solid: VoxelMask, scan: _Scanned, grid: _Grid) -> VoxelMask:
         alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
     return found
+
+
+def _guessed(
+    solid: VoxelMask, surface: tuple[Points, Points, Mask], scan: _Scanned, grid: _Grid
+) -> VoxelMask:
+    """What is said to be empty, though its end nearest by was not scanned and nobody looked in.
+
+    The cheapest labelling ends a void at the smallest surface that closes it: a dent at the rim of
+    a dome that nobody saw would take the dome along.
+
+    Parameters
+    ----------
+    surface
+        Places on the template, outward unit normals, and whether they were seen.
+    """
+    designed = grid.f_mm < 0
+    void = designed & ~solid
+    width_mm = _width_mm(scan, grid.voxel_mm)
+    ends, scanned = np.zeros_like(void), np.zeros_like(void)
+    for _, _, index, middle_mm in _facets_toward(void, designed & solid, grid):
+        ends[tuple(index.T)] = True
+        scanned[tuple(index.T)] |= has_near(middle_mm, scan.broken.place_mm, width_mm)
+    if not ends.any():
+        return np.zeros_like(void)
+    (box,) = ndimage.find_objects(void.astype(np.int8))
+    nearest = ndimage.distance_transform_edt(
+        ~ends[box], return_distances=False, return_indices=True
+    )
+    guessed = void.copy()
+    guessed[box] &= ~scanned[box][tuple(nearest)]
+    return guessed & ~_looked_into(void, surface, scan, grid) if guessed.any() else guessed
+
+
+def _looked_into(
+    void: VoxelMask, surface: tuple[Points, Points, Mask], scan: _Scanned, grid: _Grid
+) -> VoxelMask:
+    """What is empty straight below template surface that would have been seen, were it there.
+
+    What hides a part of the surface ends not just where its faces meet: what lies beside hidden
+    surface, and does not face away from it, may be hidden, too.
+    """
+    places_mm, normals, seen = surface
+    hidden = _hidden(normals, seen, scan.options)
+    within_mm = scan.options.seen_spacings * scan.spacing_mm + grid.voxel_mm
+    looked = np.zeros_like(void)
+    for axis, way, index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
+        toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
+        known = ~has_near(middle_mm, places_mm[toward], within_mm)
+        mouth = np.zeros_like(void)
+        mouth[tuple(index[known].T)] = True
+        # slices of the same arrays, from outside in
+        empty, begins, into = (np.moveaxis(each, axis, 0)[::-way] for each in (void, mouth, looked))
+        reached = np.zeros_like(empty[0])
+        for k in range(len(empty)):
+            reached = empty[k] & (reached | begins[k])
+            into[k] |= reached
+    return looked
+
+
+def _facets_toward(
+    void: VoxelMask, beside: VoxelMask, grid: _Grid
+) -> Iterator[tuple[int, int, Int[np.ndarray, "k 3"], Points]]:
+    """Axis and way; empty voxels beside which such ones lie there, and where the two meet."""
+    every = np.argwhere(void)
+    for axis in range(3):
+        for way in (1, -1):
+            step = way * np.eye(3, dtype=np.int64)[axis]
+            other = every + step
+            there = (other >= 0).all(axis=1) & (other < np.array(void.shape)).all(axis=1)
+            there[there] = beside[tuple(other[there].T)]
+            index = every[there]
+            yield axis, way, index, grid.low_mm + (index + 0.5 * (step + 1)) * grid.voxel_mm
 
 
 def _cells(

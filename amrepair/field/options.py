@@ -39,6 +39,8 @@ class OccupancyOptions:
         Probability of a point that lies on no surface.
     largest_cover
         Nothing is seen for certain: at most with this probability.
+    hidden_cover
+        Bare surface is hidden rather than gone if less was seen of what faces the same way.
     deep_mm
         So deep is a void that is as improbable as that nobody saw the surface over its mouth.
     hole_mm, margin_mm
@@ -59,6 +61,7 @@ class OccupancyOptions:
     gap_spacings: float = 1.6
     stray: float = 0.05
     largest_cover: float = 0.999
+    hidden_cover: float = 0.5
     deep_mm: float = 50.0
     hole_mm: float = 1.0
     margin_mm: float = 1.5

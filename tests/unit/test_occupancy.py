@@ -220,6 +220,44 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
     assert emptied_mm3[1] == 0.0
 
 
+def test_a_dent_at_the_rim_of_what_nobody_saw_does_not_take_it_along() -> None:
+    """Regression: a ball seen down to where it stood, and a dent there of 100 mm³ was 2,091."""
+    radius_mm, stood_mm, deep_mm, ball_mm = 21.0, -14.7, 2.5, 7.5
+    ball = MeshSdf.from_mesh(trimesh.creation.icosphere(4, radius=radius_mm))
+    rng = np.random.default_rng(1)
+    way = rng.normal(size=(14_000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    off_mm = rng.normal(0.0, 0.05, (len(way), 1))
+    points = (radius_mm + off_mm) * way
+    below = np.arccos(stood_mm / radius_mm) - 2.0 / radius_mm  # 2 mm above where it stood
+    middle = (radius_mm + ball_mm - deep_mm) * np.array([np.sin(below), 0.0, np.cos(below)])
+    within = np.linalg.norm(radius_mm * way - middle, axis=1) < ball_mm
+    from_middle = points[within] - middle
+    from_middle /= np.linalg.norm(from_middle, axis=1, keepdims=True)
+    points[within] = middle + (ball_mm - off_mm[within]) * from_middle
+    seen = (radius_mm * way)[:, 2] > stood_mm
+    deficit = compute_deficit(
+        Scan(points[seen], 0.05, "template"), ball, build_from_template=PLACED
+    )
+    gone = m3.Manifold.sphere(radius_mm, 128) ^ m3.Manifold.sphere(ball_mm, 96).translate(middle)
+    assert 0.8 * gone.volume() < deficit.missing_mm3 < 1.2 * gone.volume()
+
+
+@pytest.mark.parametrize(
+    ("size", "at"), [((9, 9, 12), (33, 17, -1)), ((8, 8, 12), (16, 8, -1))], ids=["corner", "hole"]
+)
+def test_what_is_gone_down_to_an_unseen_underside_is_measured(
+    size: tuple[float, float, float], at: tuple[float, float, float]
+) -> None:
+    """Regression: of the underside beside it as much was taken along, 1.5 of it in all."""
+    cut = m3.Manifold.cube(size).translate(at)
+    block = analytic.box((0, 0, 0), (40, 24, 10))
+    points, _ = analytic.noisy_scan_points(block.body - cut, spacing_mm=0.5, sigma_mm=0.05, seed=3)
+    above = points[points[:, 2] > 0.4]
+    deficit = compute_deficit(Scan(above, 0.05, "template"), block, build_from_template=PLACED)
+    assert deficit.missing_mm3 == pytest.approx((block.body ^ cut).volume(), rel=0.1)
+
+
 @pytest.mark.slow
 def test_a_hollow_under_a_film_is_open_though_its_mouth_is_narrow() -> None:
     """Regression: surface with material on both sides cost nothing, and 0.09 of it was found."""
