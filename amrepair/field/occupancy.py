@@ -33,6 +33,8 @@ LOOK_VOXELS = (0.75, 1.5, 2.5)
 TRACED_BLOCK, FAR_BLOCKS = 4, 1.1
 # Ways that surface can face, 9° apart.
 FACED_WAYS = 500
+# Any surface faces one of the axes by 1/√3 at least.
+LEAST_FACING = 0.57
 
 
 @dataclass(frozen=True, slots=True)
@@ -603,11 +605,11 @@ def _guessed(
     """
     designed = grid.f_mm < 0
     void = designed & ~solid
-    width_mm = _width_mm(scan, grid.voxel_mm)
-    ends, scanned = np.zeros_like(void), np.zeros_like(void)
-    for _, _, index, middle_mm in _facets_toward(void, designed & solid, grid):
-        ends[tuple(index.T)] = True
-        scanned[tuple(index.T)] |= has_near(middle_mm, scan.broken.place_mm, width_mm)
+    ends, scanned = np.zeros_like(void), {}
+    for side, index, middle_mm in _facets_toward(void, designed & solid, grid):
+        ends |= _marked(void, index)
+        known = has_near(middle_mm, scan.broken.place_mm, _width_mm(scan, grid.voxel_mm))
+        scanned[side] = _marked(void, index[known])
     if not ends.any():
         return np.zeros_like(void)
     (box,) = ndimage.find_objects(void.astype(np.int8))
@@ -615,14 +617,21 @@ def _guessed(
         ~ends[box], return_distances=False, return_indices=True
     )
     guessed = void.copy()
-    guessed[box] &= ~scanned[box][tuple(nearest)]
-    return guessed & ~_looked_into(void, surface, scan, grid) if guessed.any() else guessed
+    guessed[box] &= ~np.logical_or.reduce([*scanned.values()])[box][tuple(nearest)]
+    if guessed.any():
+        guessed &= ~_looked_into(void, scanned, surface, scan, grid)
+    return guessed
 
 
 def _looked_into(
-    void: VoxelMask, surface: tuple[Points, Points, Mask], scan: _Scanned, grid: _Grid
+    void: VoxelMask,
+    scanned: dict[tuple[int, int], VoxelMask],
+    surface: tuple[Points, Points, Mask],
+    scan: _Scanned,
+    grid: _Grid,
 ) -> VoxelMask:
-    """What is empty straight below template surface that would have been seen, were it there.
+    """What is empty straight below template surface that would have been seen, were it there, as
+    far as to an end that was scanned (by axis and way), or right through.
 
     What hides a part of the surface ends not just where its faces meet: what lies beside hidden
     surface, and does not face away from it, may be hidden, too.
@@ -630,24 +639,23 @@ def _looked_into(
     places_mm, normals, seen = surface
     hidden = _hidden(normals, seen, scan.options)
     within_mm = scan.options.seen_spacings * scan.spacing_mm + grid.voxel_mm
-    looked = np.zeros_like(void)
-    for axis, way, index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
+    mouths, looked = {}, np.zeros_like(void)
+    for (axis, way), index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
         toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
-        known = ~has_near(middle_mm, places_mm[toward], within_mm)
-        mouth = np.zeros_like(void)
-        mouth[tuple(index[known].T)] = True
-        # slices of the same arrays, from outside in
-        empty, begins, into = (np.moveaxis(each, axis, 0)[::-way] for each in (void, mouth, looked))
-        reached = np.zeros_like(empty[0])
-        for k in range(len(empty)):
-            reached = empty[k] & (reached | begins[k])
-            into[k] |= reached
+        outward = unit_vectors(scan.template.distance_and_gradient(middle_mm)[1])
+        known = way * outward[:, axis] > LEAST_FACING
+        known &= ~has_near(middle_mm, places_mm[toward], within_mm)
+        mouths[axis, way] = _marked(void, index), _marked(void, index[known])
+    for (axis, way), (_, known) in mouths.items():
+        through, _ = mouths[axis, -way]
+        found = through | scanned[axis, -way]
+        looked |= _along(void, known, axis, -way) & _along(void, found, axis, way)
     return looked
 
 
 def _facets_toward(
     void: VoxelMask, beside: VoxelMask, grid: _Grid
-) -> Iterator[tuple[int, int, Int[np.ndarray, "k 3"], Points]]:
+) -> Iterator[tuple[tuple[int, int], Int[np.ndarray, "k 3"], Points]]:
     """Axis and way; empty voxels beside which such ones lie there, and where the two meet."""
     every = np.argwhere(void)
     for axis in range(3):
@@ -657,7 +665,25 @@ def _facets_toward(
             there = (other >= 0).all(axis=1) & (other < np.array(void.shape)).all(axis=1)
             there[there] = beside[tuple(other[there].T)]
             index = every[there]
-            yield axis, way, index, grid.low_mm + (index + 0.5 * (step + 1)) * grid.voxel_mm
+            middle_mm = grid.low_mm + (index + 0.5 * (step + 1)) * grid.voxel_mm
+            yield (axis, way), index, middle_mm
+
+
+def _marked(void: VoxelMask, index: Int[np.ndarray, "k 3"]) -> VoxelMask:
+    """Which voxels are numbered so."""
+    marked = np.zeros_like(void)
+    marked[tuple(index.T)] = True
+    return marked
+
+
+def _along(void: VoxelMask, begins: VoxelMask, axis: int, way: int) -> VoxelMask:
+    """What is empty from somewhere on, along an axis."""
+    reached = begins & void
+    slices = np.moveaxis(reached, axis, 0)[::way]
+    empty = np.moveaxis(void, axis, 0)[::way]
+    for k in range(1, len(slices)):
+        slices[k] |= empty[k] & slices[k - 1]
+    return reached
 
 
 def _cells(
