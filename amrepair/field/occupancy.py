@@ -345,9 +345,7 @@ def _unexplained(scan: _Scanned, facets: _Facets, voxel_mm: float) -> Values:
     """
     share = np.ones(len(facets.one))
     on, off = np.flatnonzero(facets.on_template), np.flatnonzero(~facets.on_template)
-    f_mm, gradient = scan.template.distance_and_gradient(facets.middle_mm[on])
-    feet_mm = facets.middle_mm[on] - f_mm[:, None] * unit_vectors(gradient)
-    share[on] = ~scan.sees(feet_mm)
+    share[on] = ~scan.sees(_feet(scan.template, facets.middle_mm[on])[0])
     width_mm = _width_mm(scan, voxel_mm)
     middle_mm = facets.middle_mm[off]
     nearest = nearest_within(middle_mm, scan.broken.place_mm, 1.4 * width_mm)
@@ -355,6 +353,13 @@ def _unexplained(scan: _Scanned, facets: _Facets, voxel_mm: float) -> Values:
     apart_mm = np.linalg.norm(middle_mm[found] - scan.broken.place_mm[nearest[found]], axis=1)
     share[off[found]] = -np.expm1(-((apart_mm / width_mm) ** 4))
     return share
+
+
+def _feet(template: Template, points_mm: Points) -> tuple[Points, Points]:
+    """Nearest places on the template, and outward unit normals."""
+    f_mm, gradient = template.distance_and_gradient(points_mm)
+    outward = unit_vectors(gradient)
+    return points_mm - f_mm[:, None] * outward, outward
 
 
 def _width_mm(scan: _Scanned, voxel_mm: float) -> float:
@@ -606,9 +611,14 @@ def _guessed(
     designed = grid.f_mm < 0
     void = designed & ~solid
     ends, scanned = np.zeros_like(void), {}
+    width_mm = _width_mm(scan, grid.voxel_mm)
     for side, index, middle_mm in _facets_toward(void, designed & solid, grid):
         ends |= _marked(void, index)
-        known = has_near(middle_mm, scan.broken.place_mm, _width_mm(scan, grid.voxel_mm))
+        known = has_near(middle_mm, scan.broken.place_mm, width_mm)
+        # a film's inner side may be told from the template's surface by no point
+        feet_mm, _ = _feet(scan.template, middle_mm)
+        film = np.linalg.norm(middle_mm - feet_mm, axis=1) < width_mm
+        known |= film & scan.sees(feet_mm)
         scanned[side] = _marked(void, index[known])
     if not ends.any():
         return np.zeros_like(void)
@@ -642,8 +652,7 @@ def _looked_into(
     mouths, looked = {}, np.zeros_like(void)
     for (axis, way), index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
         toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
-        outward = unit_vectors(scan.template.distance_and_gradient(middle_mm)[1])
-        known = way * outward[:, axis] > LEAST_FACING
+        known = way * _feet(scan.template, middle_mm)[1][:, axis] > LEAST_FACING
         known &= ~has_near(middle_mm, places_mm[toward], within_mm)
         mouths[axis, way] = _marked(void, index), _marked(void, index[known])
     for (axis, way), (_, known) in mouths.items():

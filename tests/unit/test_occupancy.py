@@ -221,14 +221,12 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
     assert emptied_mm3[1] == 0.0
 
 
-@pytest.mark.parametrize(("stood_mm", "seed"), [(-14.7, 1), (-14.7, 2), (-16.5, 2)])
-def test_a_dent_at_the_rim_of_what_nobody_saw_does_not_take_it_along(
-    stood_mm: float, seed: int
-) -> None:
-    """Regression: a ball seen down to where it stood, and a dent there of 100 mm³ was 2,091."""
+@pytest.mark.parametrize("stood_mm", [-14.7, -16.5])
+def test_a_dent_at_the_rim_of_what_nobody_saw_does_not_take_it_along(stood_mm: float) -> None:
+    """Regression: a ball seen down to where it stood, and a dent there of 100 mm³ was 2,293."""
     radius_mm, deep_mm, ball_mm = 21.0, 2.5, 7.5
     ball = MeshSdf.from_mesh(trimesh.creation.icosphere(4, radius=radius_mm))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(2)
     way = rng.normal(size=(14_000, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     off_mm = rng.normal(0.0, 0.05, (len(way), 1))
