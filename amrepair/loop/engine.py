@@ -348,6 +348,8 @@ class Run:
         """What the first clean layers tell of the scanner; said and on the tape, once."""
         if look.scan.frame == PROBE:  # it measures its noise itself
             return
+        if self._learning.first_by_bed(look.plan) and not self._tape.only_read:
+            self._progress(f"{look.stop.label}: {look.plan.anomaly.told()[0]}", 1.0, 1.0)
         learned = self._learning.note(look.stop, look.plan, look.decision)
         if learned is None or self._tape.only_read:
             return
