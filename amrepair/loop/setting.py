@@ -33,7 +33,7 @@ from gcode.reader import Job, job_for
 from gcode.whole import write_bytes
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
-RUN_VERSION = 2
+RUN_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +224,10 @@ def open_run(folder: Path) -> Recorded:
             "'simulate' wrote"
         ) from error
     if not isinstance(said, dict) or said.pop("version", None) != RUN_VERSION:
-        raise InputError(f"{folder / SETTING} is of another version than {RUN_VERSION}")
+        raise InputError(
+            f"{folder / SETTING} is of another version than {RUN_VERSION}; go on with the amrepair "
+            "that began the run"
+        )
     try:
         policy = PolicyOptions(**said.pop("policy"))
         setting = Setting(policy=policy, **{key: as_tuples(value) for key, value in said.items()})

@@ -153,7 +153,8 @@ class Calibration:
             said: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             if said.pop("version") != CALIBRATION_VERSION:
                 raise InputError(
-                    f"{path}: the calibration is of another version than {CALIBRATION_VERSION}"
+                    f"{path}: the calibration is of another version than {CALIBRATION_VERSION}; "
+                    "make it again with 'amrepair calibrate'"
                 )
             return cls(**{key: as_tuples(value) for key, value in said.items()})
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
