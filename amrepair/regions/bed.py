@@ -123,6 +123,7 @@ def _beside(points_mm: Points, part_mm: Box, reach_mm: float, options: Backgroun
     stands = np.zeros(tuple(cells_of(high_mm[None], low_mm, options.bed_cell_mm)[0] + 1), bool)
     height_mm = points_mm[which, 2]
     stands[tuple(cell[height_mm > options.below_mm].T)] = True
-    stands = ndimage.binary_dilation(stands, iterations=round(apart_mm / options.bed_cell_mm))
+    cells = round(apart_mm / options.bed_cell_mm)
+    stands = ndimage.maximum_filter(stands, 2 * cells + 1)
     found[which] = ~stands[tuple(cell.T)] & (np.abs(height_mm) < options.below_mm)
     return found

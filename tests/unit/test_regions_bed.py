@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,8 +38,8 @@ def patches(points_mm: np.ndarray, seed: int, share: float = 0.04) -> np.ndarray
     return np.asarray(off[tuple(cell.T)])
 
 
-def told(points_mm: np.ndarray) -> Calibration | None:
-    return of_bed(Scan(points_mm.copy(), SIGMA_MM, "build"), PART_MM, TOLERANCE_MM, OPTIONS)
+def told(points_mm: np.ndarray, options: RegionOptions = OPTIONS) -> Calibration | None:
+    return of_bed(Scan(points_mm.copy(), SIGMA_MM, "build"), PART_MM, TOLERANCE_MM, options)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -107,4 +109,6 @@ def test_what_stands_on_the_bed_and_what_lies_beyond_its_rim_is_none_of_it() -> 
     points[post, 2] = np.random.default_rng(0).uniform(0.0, 5.0, int(post.sum()))
     beyond = points[:, 1] < -8.0
     points[beyond, 2] -= 4.0
-    assert told(points) == NORMAL_NOISE
+    for apart_mm in (1.0, 0.0):  # none apart: cells that nothing stands in are bed, not none at all
+        background = replace(OPTIONS.background, bed_apart_mm=apart_mm)
+        assert told(points, replace(OPTIONS, background=background)) == NORMAL_NOISE
