@@ -66,6 +66,11 @@ class Scale:
     def __len__(self) -> int:
         return len(self.value_mm)
 
+    @property
+    def width_mm(self) -> float:
+        """Across a window: a cell with those around it."""
+        return 3.0 * self.cell_mm
+
     def cells_of(self, chosen: Mask) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
         """(p,) windows that are chosen, and (p,) the cells in each: a pair for each cell."""
         which = np.flatnonzero(chosen)

@@ -20,7 +20,7 @@ from amrepair.frames import Transform
 from amrepair.loop import travel
 from amrepair.loop.findings import early_action
 from amrepair.loop.kinds import typed
-from amrepair.loop.learning import Learning, to_json, told
+from amrepair.loop.learning import Learning, by_bed, to_json, told
 from amrepair.loop.looks import Look, LoopReport, Stop, as_recorded, look_to_json
 from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
@@ -348,8 +348,9 @@ class Run:
         """What the first clean layers tell of the scanner; said and on the tape, once."""
         if look.scan.frame == PROBE:  # it measures its noise itself
             return
-        if self._learning.first_by_bed(look.plan) and not self._tape.only_read:
-            self._progress(f"{look.stop.label}: {look.plan.anomaly.told()[0]}", 1.0, 1.0)
+        bed, before = by_bed(look.plan), (by_bed(k.plan) for k in self._looks)
+        if bed is not None and not any(before) and not self._tape.only_read:
+            self._progress(f"{look.stop.label}: {bed.told()}", 1.0, 1.0)
         learned = self._learning.note(look.stop, look.plan, look.decision)
         if learned is None or self._tape.only_read:
             return

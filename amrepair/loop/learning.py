@@ -37,7 +37,6 @@ class Learning:
         self.calibration = given
         self._seen: list[tuple[Level, ...]] = []
         self._done = given is not None
-        self._by_bed = False
 
     def judged_by(self, site: Site) -> Site:
         """What is expected, with what is known of the scanner's errors."""
@@ -45,16 +44,10 @@ class Learning:
             return site
         return replace(site, calibration=self.calibration)
 
-    def first_by_bed(self, plan: RepairPlan) -> bool:
-        """Whether a look is the first one that is judged by the bed beside the part."""
-        first = _is_by_bed(plan) and not self._by_bed
-        self._by_bed |= first
-        return first
-
     def note(self, stop: Stop, plan: RepairPlan, decision: Decision) -> Calibration | None:
         """Learn from a look, if its layer is clean; what was learned, once that is enough."""
         clean = decision.action is Action.GO_ON and not plan.anomaly.regions
-        if _is_by_bed(plan):  # every look tells of itself
+        if by_bed(plan) is not None:  # every look tells of itself
             return None
         if self._done or not clean or stop.layer_index is None:
             return None
@@ -70,9 +63,10 @@ class Learning:
         return learned
 
 
-def _is_by_bed(plan: RepairPlan) -> bool:
+def by_bed(plan: RepairPlan) -> Calibration | None:
+    """What the bed beside the part told, of a look that is judged by it."""
     by = plan.anomaly.calibration
-    return by is not None and by.name == BED_BESIDE
+    return by if by is not None and by.name == BED_BESIDE else None
 
 
 def _as_normal(seen: list[tuple[Level, ...]]) -> bool:

@@ -90,7 +90,6 @@ def _levels(
         normal,
         surfels.deviation_mm,
         surfels.count.astype(np.float64),
-        view=None,
         tolerance_mm=tolerance_mm,
         correlation_mm=options.correlation_mm,
     )

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
-from amrepair.field.scales import RANK
 from amrepair.regions.calibration import Calibration, TailTold
-from amrepair.regions.significance import Level
+from amrepair.regions.significance import LEAST_PEAKS, Level
 
 # Peaks that are too few for it tell no tail.
 NO_TAIL: TailTold = (0.0, 0.0, 0.0, 0.0)
@@ -31,7 +30,7 @@ def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
     widths: dict[float, list[Float[np.ndarray, " c"]]] = {}
     for levels in scans:
         for level in levels[1:]:
-            width_mm = round(3.0 * level.scale.cell_mm, 1)
+            width_mm = round(level.scale.width_mm, 1)
             widths.setdefault(width_mm, []).append(level.errors.wander_mm)
     wander = []
     for found in (widths[width] for width in sorted(widths)):
@@ -47,7 +46,7 @@ def calibrated(name: str, scans: Sequence[tuple[Level, ...]]) -> Calibration:
                 level
                 for levels in scans
                 for level in levels[1:]
-                if abs(np.log2(3.0 * level.scale.cell_mm / width_mm)) <= HALF_OCTAVE
+                if abs(np.log2(level.scale.width_mm / width_mm)) <= HALF_OCTAVE
             ]
         )
     # three cells together are as wide as the narrowest windows
@@ -68,7 +67,7 @@ def _tails(alike: Sequence[Sequence[Level]], octave: Sequence[float], side: int)
     for levels, wider in zip(alike, octave, strict=True):
         peaks = np.concatenate([level.peaks[side] for level in levels])
         start = levels[0].tails[side].start
-        tells = len(peaks) >= 2 * RANK
+        tells = len(peaks) >= LEAST_PEAKS
         own = float(peaks.mean() - start) if tells else 0.0, float(len(peaks))
         if tells and wider <= HALF_OCTAVE:
             narrowest = own

@@ -8,7 +8,6 @@ from scipy.special import ndtr
 from amrepair.arrays import Mask, Numbers, Points
 from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.groups import group_points, touching_mm
-from amrepair.field.scales import RANK
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
@@ -16,7 +15,7 @@ from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import Tested, find_regions
-from amrepair.regions.significance import Level, as_student, tested
+from amrepair.regions.significance import LEAST_PEAKS, Level, as_student, tested
 from amrepair.regions.sites import (
     Observed,
     OffByJob,
@@ -179,16 +178,14 @@ def _erratic(levels: tuple[Level, ...], options: RegionOptions) -> bool:
     beyond what is allowed by `grow_sigmas`: normal noise alone leaves hardly one.
     """
     low, high = (int((peaks > options.grow_sigmas).sum()) for peaks in levels[0].peaks)
-    return min(low, high) > 0 and low + high >= 2 * RANK
+    return min(low, high) > 0 and low + high >= LEAST_PEAKS
 
 
 def _chance_mm(test: Tested, given: Calibration | None, options: RegionOptions) -> float:
     """How low a sound place may seem to lie by chance; anything, where errors tell no limit."""
     if test.calibration != given or _erratic(test.levels, options):
         return np.inf
-    first = test.levels[1]
-    errors = as_student(float(first.critical[0]), first.freedom)
-    return float(np.median(errors * first.error_mm))
+    return float(np.median(test.levels[1].chance_mm))
 
 
 def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evidence, Numbers]:

@@ -128,4 +128,4 @@ def _correlation_mm(scales: list[Scale]) -> float:
         return 0.0
     together = common >= (1.0 - SILL_SHARE) * common[0]
     last = int(np.argmin(together)) if not together.all() else len(scales)
-    return float(3.0 * scales[max(last - 1, 0)].cell_mm)
+    return float(scales[max(last - 1, 0)].width_mm)

@@ -33,6 +33,8 @@ from amrepair.regions.sites import Sites
 PAIR_QUARTILE = float(np.sqrt(2.0) * ndtri(0.625))
 # Standard error of a median, of that of a mean, for normal noise: √(π/2).
 MEDIAN_LOSS = float(np.sqrt(np.pi / 2))
+# Of fewer peaks the lower half is too few to tell a tail from.
+LEAST_PEAKS = 2 * RANK
 # Coordinates in files are rounded to micrometres; no error is smaller.
 LEAST_SIGMA_MM = 1e-3
 # Of normal noise 0.3 % lies farther out.
@@ -135,10 +137,14 @@ class Level:
         return np.asarray(self.z > self.critical[:, None])
 
     @property
+    def chance_mm(self) -> Values:
+        """(s,) how far beyond what is allowed a sound place may seem to lie, missing."""
+        return as_student(self.critical[0], self.freedom) * self.error_mm
+
+    @property
     def smallest_mm(self) -> float:
         """The deviation that half of the places would show as significant."""
-        errors = as_student(self.critical[0], self.freedom)
-        return float(np.median(self.tolerance_mm[0] + errors * self.error_mm))
+        return float(np.median(self.tolerance_mm[0] + self.chance_mm))
 
 
 def as_normal(t: Float[np.ndarray, "*n"], freedom: Values) -> Any:
@@ -223,7 +229,7 @@ def _errors(
     if calibration is None:
         wander, freedom = _wander(scale, group, classes, options, most_mm)
     else:
-        wander = calibration.wander(3.0 * scale.cell_mm, classes)
+        wander = calibration.wander(scale.width_mm, classes)
         freedom = np.full(classes, np.inf)  # of many scans
     explained = options.process_sigma_mm**2 + window**2
     common = np.sqrt(np.maximum(wander[group] ** 2 - explained, 0.0) + pose_mm**2)
@@ -343,7 +349,7 @@ def _level(
         tail = (
             _tail(peaks[side], options)
             if calibration is None
-            else calibration.tail(3.0 * scale.cell_mm if statistic else None, side, len(scale))
+            else calibration.tail(scale.width_mm if statistic else None, side, len(scale))
         )
         tails.append(tail)
         safe = np.clip(z[side], 0.0, MOST_ERRORS)
@@ -399,7 +405,7 @@ def _tail(peaks: Values, options: RegionOptions) -> Tail:
 
     while len(peaks) and peaks[-1] > reach(len(peaks)):
         peaks = peaks[:-1]
-    if len(peaks) < 2 * RANK:  # the lower half is too few to tell a tail from
+    if len(peaks) < LEAST_PEAKS:
         return Tail(start, 0.0, *2 * (float(len(peaks)),))
     beyond = peaks - start
     for sound in range(len(beyond) // 2, len(beyond) + 1):

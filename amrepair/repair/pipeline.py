@@ -224,11 +224,12 @@ def _by_the_bed(laid: _Laid, site: Site) -> Site:
     """Where nobody has told of the scanner's errors, the bed that is scanned with a part does."""
     if site.calibration != NORMAL_NOISE:
         return site
+    options = _region_options(site)
     found = of_bed(
         laid.whole.moved(laid.placed),
         box_of(laid.placed.apply(box_corners(site.template.bounds_mm))),
-        tolerances(_region_options(site), site.expected)[0],
-        _region_options(site),
+        tolerances(options, site.expected)[0],
+        options,
     )
     return site if found is None else replace(site, calibration=found)
 
