@@ -38,6 +38,7 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.loop import Stop, locate_part, plan_stops
 from amrepair.loop.kinds import typed
+from amrepair.loop.learning import Learning
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.sites import sites
 from amrepair.loop.situation import decide_look
@@ -271,9 +272,17 @@ def figures(
 
 
 def judged(
-    scan: Scan, pose: Transform, job: Job, site: Site, stop: Stop, *, rng: np.random.Generator
+    scan: Scan,
+    pose: Transform,
+    job: Job,
+    site: Site,
+    stop: Stop,
+    *,
+    rng: np.random.Generator,
+    learning: Learning | None = None,
 ) -> dict[str, Any]:
-    """What the loop decides of a scan."""
+    """What the loop decides of a scan, and what it learns of the scanner."""
+    site = site if learning is None else learning.judged_by(site)
     placed = site.build_from_template
     assert placed is not None
     plan = plan_repair(
@@ -282,6 +291,8 @@ def judged(
     )  # fmt: skip
     plan = typed(plan, job, site, stop.line, pose)
     decision = decide_look(plan, job, site, stop, (), seen_twice=False, limits=None)
+    if learning is not None:
+        learning.note(stop, plan, decision)
     changed = None
     if decision.changes_next and stop.layer_index is not None:
         after = stop.layer_index + 1
@@ -309,11 +320,14 @@ def run_job(
     scanner = Path(scanner_name).name  # of a recording, its file's
     kept = folder / f"{Path(part).stem}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner}.pickle"
     scans = kept_scans(kept, lambda: scans_of(job, stops, told, scanner_name, seed))
-    seen = []
+    seen, learning = [], Learning()
     for number, (stop, (scan, pose)) in enumerate(zip(stops, scans, strict=True), start=1):
         site = site_at(stop)
         try:
-            row = judged(scan, pose, job, site, stop, rng=np.random.default_rng([seed, number]))
+            row = judged(
+                scan, pose, job, site, stop,
+                rng=np.random.default_rng([seed, number]), learning=learning,
+            )  # fmt: skip
         except AlignmentError as error:  # twice in a row, and the loop ends
             row = {"stop": stop.label, "z_mm": round(stop.z_mm, 2), **NOTHING, "why": str(error)}
         seen.append(row)

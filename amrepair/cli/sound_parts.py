@@ -11,10 +11,10 @@ import numpy as np
 from amrepair.align import align
 from amrepair.errors import InputError
 from amrepair.regions import detect
-from amrepair.regions.calibrating import calibrated
+from amrepair.regions.calibrating import Sound, calibrated
 from amrepair.regions.calibration import file_of, users_folder
-from amrepair.regions.detection import judged_levels
-from amrepair.regions.significance import Level
+from amrepair.regions.detection import judged_scales
+from amrepair.regions.options import RegionOptions
 from amrepair.scans import read_scan
 from amrepair.template import open_template
 from gcode.cli import console
@@ -38,7 +38,7 @@ def run(
     folder = users_folder()
     file_of(name, folder)
     bars = console.Bars()
-    seen: list[tuple[Level, ...]] = []
+    seen: list[Sound] = []
     with bars.shown():
         field = open_template(template, progress=bars)
         for path in sound:
@@ -46,8 +46,8 @@ def run(
                 cloud = read_scan(path, frame="scanner", unit=scan_unit)
             pose = align(cloud, field, rng=np.random.default_rng(seed), progress=bars)
             with bars.stage(f"look at {path.name}"):
-                seen.append(judged_levels(detect(cloud.moved(pose.template_from_scan), field)))
-    found = calibrated(name, seen)
+                seen.append(judged_scales(detect(cloud.moved(pose.template_from_scan), field)))
+    found = calibrated(name, seen, RegionOptions())
     kept = found.save(folder)
     if as_json:
         console.show_json({**asdict(found), "file": str(kept)})

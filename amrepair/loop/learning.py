@@ -1,8 +1,8 @@
 """What a run learns of its scanner from its own first clean layers.
 
 Until then, and where errors turn out to be normal, looks are judged by normal noise; where the bed
-beside the part says otherwise, every look by its own bed, and nothing is learned. A calibration
-that somebody named goes before all of that.
+beside the part says otherwise, every look by its bed and those of the looks before it, and nothing
+is learned from layers. A calibration that somebody named goes before all of that.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import numpy as np
 
 from amrepair.loop.looks import Stop
 from amrepair.policy.table import Action, Decision
-from amrepair.regions.calibrating import calibrated
+from amrepair.regions.calibrating import Sound, by_width, calibrated
 from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
-from amrepair.regions.detection import judged_levels
-from amrepair.regions.significance import Level
+from amrepair.regions.detection import judged_scales
 from amrepair.repair import RepairPlan, Site
 
 FIRST_LOOKS = 3  # clean layers that are learned from
@@ -35,11 +34,13 @@ class Learning:
 
     def __init__(self, given: Calibration | None = None) -> None:
         self.calibration = given
-        self._seen: list[tuple[Level, ...]] = []
+        self._seen: list[Sound] = []
+        self._beds: tuple[Sound, ...] = ()
         self._done = given is not None
 
     def judged_by(self, site: Site) -> Site:
         """What is expected, with what is known of the scanner's errors."""
+        site = replace(site, beds=self._beds)
         if self.calibration is None or site.calibration != NORMAL_NOISE:
             return site
         return replace(site, calibration=self.calibration)
@@ -47,16 +48,20 @@ class Learning:
     def note(self, stop: Stop, plan: RepairPlan, decision: Decision) -> Calibration | None:
         """Learn from a look, if its layer is clean; what was learned, once that is enough."""
         clean = decision.action is Action.GO_ON and not plan.anomaly.regions
-        if by_bed(plan) is not None:  # every look tells of itself
+        self._beds = plan.beds
+        if by_bed(plan) is not None:  # it tells in every look
             return None
         if self._done or not clean or stop.layer_index is None:
             return None
-        self._seen.append(judged_levels(plan.anomaly))
+        self._seen.append(judged_scales(plan.anomaly))
         if len(self._seen) < FIRST_LOOKS:
             return None
         self._done = True
+        assert plan.anomaly.options is not None
         learned = (
-            NORMAL_NOISE if _as_normal(self._seen) else calibrated(OWN_CALIBRATION, self._seen)
+            NORMAL_NOISE
+            if _as_normal(self._seen)
+            else calibrated(OWN_CALIBRATION, self._seen, plan.anomaly.options)
         )
         self._seen = []
         self.calibration = learned
@@ -69,12 +74,11 @@ def by_bed(plan: RepairPlan) -> Calibration | None:
     return by if by is not None and by.name == BED_BESIDE else None
 
 
-def _as_normal(seen: list[tuple[Level, ...]]) -> bool:
+def _as_normal(seen: list[Sound]) -> bool:
     """Whether windows wander by no more than normal noise and the process leave, at any width."""
-    widths = zip(*(levels[1:] for levels in seen), strict=False)
     return all(
-        float(np.median(np.concatenate([level.errors.common_mm for level in one]))) == 0.0
-        for one in widths
+        float(np.median([scale.common_mm for scale in alike])) == 0.0
+        for alike in by_width(seen).values()
     )
 
 

@@ -33,7 +33,7 @@ from gcode.reader import Job, job_for
 from gcode.whole import write_bytes
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
-RUN_VERSION = 3
+RUN_VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ errors, and the bed is seen in the same scan, by the same sensor, as well as the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,13 @@ from amrepair.frames import cells_of, in_box
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import fit_nuisance
 from amrepair.observe.options import BackgroundOptions
-from amrepair.regions.calibrating import NO_TAIL, calibrated
+from amrepair.regions.calibrating import (
+    NONE_FAR_OFF,
+    Sound,
+    by_width,
+    calibrated,
+    sound_scales,
+)
 from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import Level, tested
@@ -28,10 +35,8 @@ from amrepair.scans.range_grid import FLYING
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def of_bed(
-    scan: Scan, part_mm: Box, tolerance_mm: float, options: RegionOptions
-) -> Calibration | None:
-    """What the bed beside a part tells of a scan's errors; None where too little of it is seen.
+def of_bed(scan: Scan, part_mm: Box, tolerance_mm: float, options: RegionOptions) -> Sound | None:
+    """What the bed beside a part shows of a scan's errors; None where too little of it is seen.
 
     Parameters
     ----------
@@ -41,6 +46,13 @@ def of_bed(
         Box around the part.
     tolerance_mm
         δ, as the part is tested by.
+    """
+    levels = _levels(scan, part_mm, tolerance_mm, options)
+    return None if levels is None else sound_scales(levels, options)
+
+
+def by_beds(beds: Sequence[Sound], options: RegionOptions) -> Calibration:
+    """What the bed in a run's looks tells of its scanner's errors.
 
     Returns
     -------
@@ -48,24 +60,36 @@ def of_bed(
         How far window means wander and how what lies too low falls off, for too low and too high
         alike; `NORMAL_NOISE` where there is neither.
     """
-    levels = _levels(scan, part_mm, tolerance_mm, options)
-    if levels is None:
-        return None
-    found = calibrated(BED_BESIDE, (levels,))
+    found = calibrated(BED_BESIDE, beds, options)
     # the process leaves nothing there: of a part the test takes so much out
     process_mm = options.process_sigma_mm
     usual = all(
-        level.errors.wander_mm[0] <= np.hypot(process_mm, np.median(level.errors.window_mm))
-        for level in levels[1:]
+        told[0] <= np.hypot(process_mm, float(np.median([scale.window_mm for scale in alike])))
+        for told, alike in zip(found.wander_mm, by_width(beds).values(), strict=True)
     )
-    if usual and all(low == NO_TAIL for low, _ in found.tails):
+    if usual and all(low == NONE_FAR_OFF for low, _ in found.far_off):
         return NORMAL_NOISE
+    both = [
+        _and_process(*told, process_mm) for told in zip(found.wander_mm, found.freedom, strict=True)
+    ]
     return replace(
         found,
-        wander_mm=tuple(tuple(np.hypot(w, process_mm).tolist()) for w in found.wander_mm),
+        wander_mm=tuple(wander_mm for wander_mm, _ in both),
+        freedom=tuple(freedom for _, freedom in both),
         # on the bed lies what a skirt, a brim or a nozzle left there; below it nothing does
-        tails=tuple((low, low) for low, _ in found.tails),
+        far_off=tuple((low, low) for low, _ in found.far_off),
     )
+
+
+def _and_process(
+    wander_mm: tuple[float, ...], freedom: tuple[float, ...], process_mm: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What windows wander by where the process adds what is known, and its degrees of freedom."""
+    told_mm = np.array(wander_mm)
+    both_mm = np.hypot(told_mm, process_mm)
+    known = np.full(len(told_mm), np.inf)
+    np.divide(np.array(freedom) * both_mm**4, told_mm**4, out=known, where=told_mm > 0.0)
+    return tuple(both_mm.tolist()), tuple(known.tolist())
 
 
 def _levels(

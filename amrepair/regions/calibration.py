@@ -1,7 +1,7 @@
 """Calibration: what a scanner and a printer leave on sound parts, learned once and kept by name.
 
 It stands in for what a scan has to tell of itself: how far window means wander, by their width and
-by how densely they were seen, and how the peaks over the tolerance fall off.
+by how densely they were seen, and how far off sound places may seem to lie.
 """
 
 from __future__ import annotations
@@ -12,55 +12,53 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import t
 
 from amrepair.arrays import Values
 from amrepair.errors import InputError
 from gcode.whole import write_bytes
 
-CALIBRATION_VERSION = 3
+CALIBRATION_VERSION = 4
+
+
+FarOffTold = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Tail:
-    """How the standardised exceedances of sound places fall off.
+class FarOff:
+    """How far beyond what is allowed sound places seem to lie where a scanner errs most.
+
+    What lies so far off is as deep at places that are seen well as at others, whatever they err by
+    otherwise: it is told in millimetres, not in standard errors. Depths are normal, one side.
 
     Attributes
     ----------
-    start, scale
-        Beyond `start` peaks are exponential with mean `scale`; 0: as normal noise.
-    peaks
-        How many such peaks a scan has.
+    spread_mm
+        Root of their mean square; 0: none lies far off.
+    places
+        How many such places a scan has.
     told_by
-        How many peaks told the scale: the fewer, the less sure it is.
-    longest
-        They fall to 1/e over so many standard errors at most, however few told the scale.
+        How many told the spread.
     """
 
-    start: float
-    scale: float
-    peaks: float
+    spread_mm: float
+    places: float
     told_by: float
-    longest: float = np.inf
 
-    def log_expected(self, z: Values) -> Values:
-        """(s,) logarithm of how many peaks of sound places a scan has beyond each value.
+    def log_expected(self, beyond_mm: Values) -> Values:
+        """(s,) logarithm of how many such places of a scan lie deeper than each.
 
-        An exponential whose mean is itself told by `told_by` peaks predicts a Lomax tail.
+        A normal value whose spread is itself told by so many is distributed as Student's t.
         """
-        beyond = np.maximum(z - self.start, 0.0)
-        falls = np.maximum(
-            self.told_by * np.log1p(beyond / (self.told_by * self.scale)), beyond / self.longest
-        )
-        return np.asarray(np.log(self.peaks) - falls)
+        if not self.spread_mm:
+            return np.full(len(beyond_mm), -np.inf)
+        ratio = np.maximum(beyond_mm, 0.0) / self.spread_mm
+        return np.asarray(np.log(2.0 * self.places) + t.logsf(ratio, self.told_by))
 
     def exceeded_by(self, expected: float) -> float:
-        """Beyond which value a scan has so many peaks of sound places."""
-        ratio = max(self.peaks / expected, 1.0)
-        told = self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
-        return self.start + min(told, self.longest * float(np.log(ratio)))
-
-
-TailTold = tuple[float, float, float, float]
+        """Beyond which depth, mm, a scan has so many such places; 0 where it has fewer at all."""
+        share = 0.5 * min(expected / self.places, 1.0) if self.spread_mm else 0.5
+        return self.spread_mm * float(t.isf(share, self.told_by)) if share < 0.5 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,35 +71,43 @@ class Calibration:
         What it is kept by, and how many scans of sound parts it was learned from.
     width_mm
         (k,) widths of the windows that it knows.
-    wander_mm
+    wander_mm, freedom
         (k, c) standard deviation of window means, by width and by how well they were seen, the
-        best first.
-    tails
+        best first, and its degrees of freedom.
+    far_off
         Of three cells together, then of window medians by width: for side 0, missing, and 1,
-        excess, start, scale, peaks a window and peaks in all. In wide windows errors that lie far
-        off at one place fall out.
+        excess, the spread in mm, places a window and places in all. In wide windows errors that
+        lie far off at one place fall out.
+    facing
+        Cosine of incidence down to which it tells; what is seen more aslant errs the more.
     """
 
     name: str
     scans: int
     width_mm: tuple[float, ...] = ()
     wander_mm: tuple[tuple[float, ...], ...] = ()
-    tails: tuple[tuple[TailTold, TailTold], ...] = ()
+    freedom: tuple[tuple[float, ...], ...] = ()
+    far_off: tuple[tuple[FarOffTold, FarOffTold], ...] = ()
+    facing: float = 0.0
 
-    def wander(self, width_mm: float, classes: int) -> Values:
-        """(c,) standard deviation of means of windows so wide, by class; 0 where none is known."""
+    def wander(self, width_mm: float, classes: int) -> tuple[Values, Values]:
+        """(c,) standard deviation of means of windows so wide, by class, 0 where none is known.
+
+        And (c,) its degrees of freedom.
+        """
         if not self.width_mm:
-            return np.zeros(classes)
-        known = np.array(self.wander_mm[self._nearest(width_mm)])
-        return np.asarray(known[np.minimum(np.arange(classes), len(known) - 1)])
+            return np.zeros(classes), np.full(classes, np.inf)
+        row = self._nearest(width_mm)
+        known = np.minimum(np.arange(classes), len(self.wander_mm[row]) - 1)
+        return np.array(self.wander_mm[row])[known], np.array(self.freedom[row])[known]
 
-    def tail(self, width_mm: float | None, side: int, windows: int) -> Tail:
-        """How the peaks of so many windows fall off; without a width, of three cells together."""
-        if not self.tails:
-            return Tail(0.0, 0.0, 0.0, 0.0)
+    def far_off_in(self, width_mm: float | None, side: int, windows: int) -> FarOff:
+        """What lies far off of so many windows; without a width, of three cells together."""
+        if not self.far_off:
+            return FarOff(0.0, 0.0, 0.0)
         row = 0 if width_mm is None else 1 + self._nearest(width_mm)
-        start, scale, rate, told_by = self.tails[row][side]
-        return Tail(start, scale, rate * windows, told_by)
+        spread_mm, rate, told_by = self.far_off[row][side]
+        return FarOff(spread_mm, rate * windows, told_by)
 
     def _nearest(self, width_mm: float) -> int:
         """The width that is known and most alike."""
@@ -172,7 +178,7 @@ def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
         By how much sound parts depart as a whole, which the test takes out of the wander.
     """
     wander_mm = float(np.hypot(sigma_mm, process_sigma_mm))
-    return Calibration("repeated touches", 1, (1.0,), ((wander_mm,),))
+    return Calibration("repeated touches", 1, (1.0,), ((wander_mm,),), ((np.inf,),))
 
 
 # What an own calibration of a scan by the bed in it is called.

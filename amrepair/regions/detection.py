@@ -10,6 +10,7 @@ from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
+from amrepair.regions.calibrating import Sound, sound_scales
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
@@ -204,14 +205,14 @@ def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evid
     return with_stubs(evidence, seen.surface_mm[test.gone], labelled), surface_label
 
 
-def judged_levels(anomaly: AnomalyMap) -> tuple[Level, ...]:
-    """The tested scales of a scan of a sound part, for a calibration to learn from.
+def judged_scales(anomaly: AnomalyMap) -> Sound:
+    """What a scan of a sound part shows of its errors, for a calibration to learn from.
 
     As the scan itself tells, whatever calibration it was judged by.
     """
     assert anomaly.sites is not None
     assert anomaly.options is not None
-    return tested(anomaly.sites, anomaly.options, None)
+    return sound_scales(tested(anomaly.sites, anomaly.options, None), anomaly.options)
 
 
 def _strands(

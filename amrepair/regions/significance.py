@@ -25,7 +25,7 @@ from amrepair.field import scales_kernels
 from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.frames import cells_of
-from amrepair.regions.calibration import Calibration, Tail
+from amrepair.regions.calibration import Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import Sites
 
@@ -47,6 +47,46 @@ PAIRS_EFFICIENCY = 0.82
 
 
 @dataclass(frozen=True, slots=True)
+class Tail:
+    """How the standardised exceedances of sound places fall off.
+
+    Attributes
+    ----------
+    start, scale
+        Beyond `start` peaks are exponential with mean `scale`; 0: as normal noise.
+    peaks
+        How many such peaks a scan has.
+    told_by
+        How many peaks told the scale: the fewer, the less sure it is.
+    longest
+        They fall to 1/e over so many standard errors at most, however few told the scale.
+    """
+
+    start: float
+    scale: float
+    peaks: float
+    told_by: float
+    longest: float = np.inf
+
+    def log_expected(self, z: Values) -> Values:
+        """(s,) logarithm of how many peaks of sound places a scan has beyond each value.
+
+        An exponential whose mean is itself told by `told_by` peaks predicts a Lomax tail.
+        """
+        beyond = np.maximum(z - self.start, 0.0)
+        falls = np.maximum(
+            self.told_by * np.log1p(beyond / (self.told_by * self.scale)), beyond / self.longest
+        )
+        return np.asarray(np.log(self.peaks) - falls)
+
+    def exceeded_by(self, expected: float) -> float:
+        """Beyond which value a scan has so many peaks of sound places."""
+        ratio = max(self.peaks / expected, 1.0)
+        told = self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
+        return self.start + min(told, self.longest * float(np.log(ratio)))
+
+
+@dataclass(frozen=True, slots=True)
 class Errors:
     """Standard errors of a scale.
 
@@ -62,6 +102,8 @@ class Errors:
         (c,) its degrees of freedom.
     group
         (s,) class of how well each window was seen.
+    facing
+        Cosine of incidence of all but a few windows, at least.
     """
 
     cell_mm: Values
@@ -70,6 +112,7 @@ class Errors:
     wander_mm: Float[np.ndarray, " c"]
     freedom: Float[np.ndarray, " c"]
     group: Numbers
+    facing: float
 
     @property
     def independent(self) -> float:
@@ -106,17 +149,19 @@ class Level:
         (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
     freedom
         (s,) degrees of freedom of the standard error.
-    z
+    beyond_mm, z
         (2, s) how far beyond the tolerance, missing, excess: the normal value as rare as so many
         standard errors are with so few degrees of freedom.
     critical
         (2,) from which on they are significant.
+    far_off_mm
+        (2,) how far beyond the tolerance they must lie for that, too, as sound places may seem to.
     quantile
         From which on they would be if errors were normal.
     log_p
         (2, s) natural logarithm of the expected number of false regions as high or higher.
-    tails, peaks
-        For missing and excess: how peaks of sound places fall off, and the peaks themselves.
+    peaks
+        For missing and excess: the highest of each group of windows that stand out.
     """
 
     scale: Scale
@@ -124,22 +169,33 @@ class Level:
     tolerance_mm: Float[np.ndarray, "2 s"]
     error_mm: Values
     freedom: Values
+    beyond_mm: Float[np.ndarray, "2 s"]
     z: Float[np.ndarray, "2 s"]
     critical: Float[np.ndarray, " 2"]
+    far_off_mm: Float[np.ndarray, " 2"]
     quantile: float
     log_p: Float[np.ndarray, "2 s"]
-    tails: tuple[Tail, Tail]
     peaks: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]
 
     @property
     def rejected(self) -> Bool[np.ndarray, "2 s"]:
         """(2, s) windows whose deviation is significant."""
-        return np.asarray(self.z > self.critical[:, None])
+        far = self.beyond_mm > self.far_off_mm[:, None]
+        return np.asarray(far & (self.z > self.critical[:, None]))
 
     @property
     def chance_mm(self) -> Values:
         """(s,) how far beyond what is allowed a sound place may seem to lie, missing."""
-        return as_student(self.critical[0], self.freedom) * self.error_mm
+        by_noise_mm = as_student(self.critical[0], self.freedom) * self.error_mm
+        return np.maximum(by_noise_mm, self.far_off_mm[0])
+
+    def far_mm(self, start: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]:
+        """(p,), (q,) how far beyond the tolerance groups of windows lie that stand out so far."""
+        low, high = (
+            _peaks(self.scale, z > start, beyond_mm)
+            for z, beyond_mm in zip(self.z, self.beyond_mm, strict=True)
+        )
+        return low, high
 
     @property
     def smallest_mm(self) -> float:
@@ -195,7 +251,7 @@ def tested(
         )
         group = seen_class(scale, faced, options.seen_step)
         most_mm = options.most_wander * point_sigma_mm(scales[0])
-        errors = _errors(scale, group, pose, options, calibration, most_mm)
+        errors = _errors(scale, group, faced, pose, options, calibration, most_mm)
         means = np.stack([-scale.median_mm, scale.median_mm])
         thirds = np.stack([-scale.low_mm, scale.high_mm])
         for statistic, sides in ((0, thirds), (1, means))[0 if k == 0 else 1 :]:
@@ -215,6 +271,7 @@ def point_sigma_mm(first: Scale) -> float:
 def _errors(
     scale: Scale,
     group: Numbers,
+    facing: Values,
     pose_mm: Values,
     options: RegionOptions,
     calibration: Calibration | None,
@@ -229,11 +286,16 @@ def _errors(
     if calibration is None:
         wander, freedom = _wander(scale, group, classes, options, most_mm)
     else:
-        wander = calibration.wander(scale.width_mm, classes)
-        freedom = np.full(classes, np.inf)  # of many scans
+        wander, freedom = calibration.wander(scale.width_mm, classes)
+    # nothing that was seen so far aslant has told
+    aslant = 1.0 if calibration is None else np.maximum(calibration.facing / facing, 1.0)
     explained = options.process_sigma_mm**2 + window**2
-    common = np.sqrt(np.maximum(wander[group] ** 2 - explained, 0.0) + pose_mm**2)
-    return Errors(cell, window, common, wander, freedom, group)
+    common = np.sqrt(np.maximum((wander[group] * aslant) ** 2 - explained, 0.0) + pose_mm**2)
+    least = np.partition(facing, min(options.least_cells, len(facing)) - 1)
+    return Errors(
+        cell, window, common, wander, freedom, group,
+        facing=float(least[min(options.least_cells, len(facing)) - 1]),
+    )  # fmt: skip
 
 
 def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:
@@ -329,7 +391,8 @@ def _level(
     )
     error_mm = np.hypot(own_mm, errors.common_mm)
     freedom = errors.freedom_of(error_mm)
-    z = as_normal((sides - tolerance_mm) / error_mm, freedom)
+    beyond_mm = sides - tolerance_mm
+    z = as_normal(beyond_mm / error_mm, freedom)
     alone = ~scale.is_surface
     z[:, alone] = -np.inf
     n = max(int((~alone).sum()), 1)
@@ -342,25 +405,22 @@ def _level(
         outliers = outlying > np.maximum(OUTLIER_SIGMAS * error_mm, tolerance_mm[0])
         if n * comb(usual, RANK) * _usual_share(scale, outliers) ** RANK > share:
             quantile = np.inf  # so many outlying cells fall together by chance
-    log_p, critical = np.empty_like(z), np.empty(2)
-    peaks = tuple(_peaks(scale, side, options.tail_from) for side in z)
-    tails = []
-    for side in range(2):
-        tail = (
-            _tail(peaks[side], options)
-            if calibration is None
-            else calibration.tail(scale.width_mm if statistic else None, side, len(scale))
-        )
-        tails.append(tail)
-        safe = np.clip(z[side], 0.0, MOST_ERRORS)
-        log_p[side] = np.log(n * ways) + together * log_ndtr(-safe)
-        critical[side] = quantile
-        if tail.scale > 0:
-            log_p[side] = np.maximum(log_p[side], tail.log_expected(safe))
+    safe = np.clip(z, 0.0, MOST_ERRORS)
+    log_p = np.log(n * ways) + together * log_ndtr(-safe)
+    critical, far_off_mm = np.full(2, quantile), np.zeros(2)
+    low, high = (_peaks(scale, side > options.tail_from, side) for side in z)
+    for side, peaks in enumerate((low, high)):
+        if calibration is not None:
+            width_mm = scale.width_mm if statistic else None
+            far_off = calibration.far_off_in(width_mm, side, len(scale))
+            log_p[side] = np.maximum(log_p[side], far_off.log_expected(beyond_mm[side]))
+            far_off_mm[side] = far_off.exceeded_by(share)
+        elif (tail := _tail(peaks, options)).scale > 0:
+            log_p[side] = np.maximum(log_p[side], tail.log_expected(safe[side]))
             critical[side] = max(quantile, tail.exceeded_by(share))
     return Level(
-        scale, errors, tolerance_mm, error_mm, freedom, z, critical, quantile, log_p,
-        (tails[0], tails[1]), (peaks[0], peaks[1]),
+        scale, errors, tolerance_mm, error_mm, freedom, beyond_mm, z, critical, far_off_mm,
+        quantile, log_p, (low, high),
     )  # fmt: skip
 
 
@@ -381,13 +441,12 @@ def _groups(scale: Scale, chosen: Mask) -> Numbers:
     return connected(window[beside], cell[beside], len(chosen))
 
 
-def _peaks(scale: Scale, z: Values, start: float) -> Float[np.ndarray, " p"]:
-    """(p,) the highest of each connected group of windows that exceed `start`, rising."""
-    over = z > start
+def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
+    """(p,) the highest value of each connected group of windows that stand out, rising."""
     group = _groups(scale, over)
-    peak = np.full(len(z), -np.inf)
-    np.maximum.at(peak, group[over], z[over])
-    return np.sort(peak[peak > start])
+    peak = np.full(len(value), -np.inf)
+    np.maximum.at(peak, group[over], value[over])
+    return np.sort(peak[np.isfinite(peak)])
 
 
 def _tail(peaks: Values, options: RegionOptions) -> Tail:

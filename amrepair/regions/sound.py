@@ -24,8 +24,7 @@ from amrepair.field.fused import estimate_spacing
 from amrepair.field.near import spacing_in
 from amrepair.field.scales import Scale, scales_of
 from amrepair.frames import unit_vectors
-from amrepair.regions.calibration import Tail
-from amrepair.regions.significance import LEAST_SIGMA_MM
+from amrepair.regions.significance import LEAST_SIGMA_MM, Tail
 from amrepair.template.port import Template
 
 # Of a sum of terms of variance 1 and more: less is rounding.

@@ -27,7 +27,7 @@ from amrepair.deficit.options import DeficitOptions
 from amrepair.frames import Transform, box_corners, box_of
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
-from amrepair.regions.bed import of_bed
+from amrepair.regions.bed import by_beds, of_bed
 from amrepair.regions.calibration import NORMAL_NOISE, of_touches
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import PoseKnown, tolerances
@@ -174,6 +174,7 @@ class _Laid:
             site.setup.process.layer_height_mm,
             self.judged,
             site.policy,
+            beds=site.beds,
         )
 
 
@@ -221,17 +222,21 @@ def _align(
 
 
 def _by_the_bed(laid: _Laid, site: Site) -> Site:
-    """Where nobody has told of the scanner's errors, the bed that is scanned with a part does."""
+    """Where nobody has told of the scanner's errors, the bed that is scanned with a part does.
+
+    And what it showed in the looks before.
+    """
     if site.calibration != NORMAL_NOISE:
         return site
     options = _region_options(site)
-    found = of_bed(
+    seen = of_bed(
         laid.whole.moved(laid.placed),
         box_of(laid.placed.apply(box_corners(site.template.bounds_mm))),
         tolerances(options, site.expected)[0],
         options,
     )
-    return site if found is None else replace(site, calibration=found)
+    beds = site.beds if seen is None else (*site.beds, seen)
+    return replace(site, beds=beds, calibration=by_beds(beds, options)) if beds else site
 
 
 def _judge(

@@ -9,6 +9,7 @@ from amrepair.deficit import Deficit
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY, PolicyOptions, worth
 from amrepair.regions import AnomalyMap, Region
+from amrepair.regions.calibrating import Sound
 from amrepair.scans import Scan
 from gcode.check import CheckedProgram
 from gcode.estimate import Estimate
@@ -31,6 +32,9 @@ class RepairPlan:
         By what was decided which regions are worth a repair.
     refused
         Why the checker refused the program, where it did and the caller wanted to go on.
+    beds
+        What the bed beside the part showed of the scanner's errors, in this look and in earlier
+        ones of its run.
 
     Examples
     --------
@@ -56,6 +60,7 @@ class RepairPlan:
     checked: CheckedProgram | None = None
     estimate: Estimate | None = None
     refused: str = ""
+    beds: tuple[Sound, ...] = ()
 
     @property
     def build_from_template(self) -> Transform:

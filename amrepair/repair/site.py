@@ -14,6 +14,7 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.regions import AnomalyMap, detect
+from amrepair.regions.calibrating import Sound
 from amrepair.regions.calibration import Calibration
 from amrepair.regions.skipped import PlannedBeads
 from amrepair.repair.options import USUAL_REPAIR, RepairOptions
@@ -96,6 +97,8 @@ class Site:
         By how much sound parts of the process depart as a whole: a quarter of a layer.
     calibration
         What sound parts look like to this scanner; None: as the scan itself tells.
+    beds
+        What the bed beside the part showed of the scanner's errors in earlier looks.
     on_fixture
         Somebody said that a finished part's foot is above the bed.
     damage_at_mm
@@ -144,6 +147,7 @@ class Site:
     allowance_mm: float = 0.1
     process_sigma_mm: float = 0.05
     calibration: Calibration | None = None
+    beds: tuple[Sound, ...] = ()
     planned: Template | None = None
     on_fixture: bool = False
     damage_at_mm: tuple[float, float] | None = None

@@ -135,14 +135,16 @@ def test_where_the_bed_tells_long_tails_each_look_is_judged_by_it(
     report, _, said = _run(small, tmp_path, 0.0, scans=with_bed)
     by = [look.plan.anomaly.calibration for look in report.looks]
     assert {one.name for one in by if one is not None} == {BED_BESIDE}
-    assert len(set(by)) == len(LAYERS)  # each its own
+    # each by its own and by those before it
+    assert [one.scans for one in by if one is not None] == list(range(1, len(LAYERS) + 1))
     assert report.calibration is None
     assert sum(BED_BESIDE in stage for stage in said) == 1
     assert all(not one.differences for one in replay(tmp_path))
 
 
 def test_a_calibration_that_somebody_named_goes_before(small: Small, tmp_path: Path) -> None:
-    given = Calibration("bench", 4, (3.0,), ((0.08, 0.1),), (((1.0, 0.2, 0.001, 9.0),) * 2,) * 2)
+    far_off = ((0.2, 0.001, 9.0), (0.2, 0.001, 9.0))
+    given = Calibration("bench", 4, (3.0,), ((0.08, 0.1),), ((50.0, 9.0),), (far_off,) * 2)
     report, _, _ = _run(small, tmp_path, HIGH_MM, given)
     assert report.calibration == given
     assert {look.plan.anomaly.calibration for look in report.looks} == {given}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amrepair.regions.bed import of_bed
+from amrepair.regions.bed import by_beds, of_bed
 from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
@@ -38,8 +38,12 @@ def patches(points_mm: np.ndarray, seed: int, share: float = 0.04) -> np.ndarray
     return np.asarray(off[tuple(cell.T)])
 
 
-def told(points_mm: np.ndarray, options: RegionOptions = OPTIONS) -> Calibration | None:
-    return of_bed(Scan(points_mm.copy(), SIGMA_MM, "build"), PART_MM, TOLERANCE_MM, options)
+def told(*looks: np.ndarray, options: RegionOptions = OPTIONS) -> Calibration | None:
+    """What the bed tells in some looks; None where none shows enough of it."""
+    scans = [Scan(points_mm.copy(), SIGMA_MM, "build") for points_mm in looks]
+    beds = [of_bed(scan, PART_MM, TOLERANCE_MM, options) for scan in scans]
+    seen = [bed for bed in beds if bed is not None]
+    return by_beds(seen, options) if seen else None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -60,13 +64,29 @@ def test_errors_with_a_long_tail_are_learned_from_below_the_bed(seed: int) -> No
     assert found is not None
     assert found.name == BED_BESIDE
     for width_mm in (None, 1.0):
-        low, high = (found.tail(width_mm, side, 1000) for side in (0, 1))
+        low, high = (found.far_off_in(width_mm, side, 1000) for side in (0, 1))
         assert low == high
-        # patches of 0.3 mm in the mean, over errors of windows of a hundredth
-        assert low.scale > 10.0
-        assert low.exceeded_by(0.005) > 6.0  # of normal noise 4.6 is enough
+        # what is left of patches of 0.3 mm in the mean beyond a tolerance of half of that
+        assert 0.15 < low.spread_mm < 0.45
+        assert low.exceeded_by(0.005) > 2.0 * low.spread_mm
     # a patch as narrow as that is none of a window of 8 mm
-    assert found.tail(8.0, 0, 1000).scale == 0.0
+    assert found.far_off_in(8.0, 0, 1000).spread_mm == 0.0
+
+
+def test_the_more_looks_show_the_bed_the_surer_it_tells() -> None:
+    beds = [bed(seed) for seed in range(4)]
+    for seed, points in enumerate(beds):
+        points[:, 2] += patches(points, seed, share=0.01)
+    one, four = told(beds[0]), told(*beds)
+    assert one is not None
+    assert four is not None
+    assert (one.scans, four.scans) == (1, 4)
+    assert four.freedom[0][0] > 2.0 * one.freedom[0][0]
+    few, many = (found.far_off_in(1.0, 0, 1000) for found in (one, four))
+    assert many.told_by > few.told_by
+    assert many.exceeded_by(0.005) / many.spread_mm < few.exceeded_by(0.005) / few.spread_mm
+    # a look that shows nothing far off is one of a scanner that did
+    assert told(beds[0], bed(9)) != NORMAL_NOISE
 
 
 def test_what_lies_on_the_bed_is_no_error_of_the_scanners() -> None:
@@ -111,4 +131,4 @@ def test_what_stands_on_the_bed_and_what_lies_beyond_its_rim_is_none_of_it() -> 
     points[beyond, 2] -= 4.0
     for apart_mm in (1.0, 0.0):  # none apart: cells that nothing stands in are bed, not none at all
         background = replace(OPTIONS.background, bed_apart_mm=apart_mm)
-        assert told(points, replace(OPTIONS, background=background)) == NORMAL_NOISE
+        assert told(points, options=replace(OPTIONS, background=background)) == NORMAL_NOISE

@@ -16,10 +16,12 @@ from amrepair.errors import InputError
 from amrepair.field.scales import RANK, WINDOW_FACING, scales_of
 from amrepair.regions import Label, detect
 from amrepair.regions.calibrating import calibrated
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration, Tail
-from amrepair.regions.detection import judged_levels
+from amrepair.regions.calibration import NORMAL_NOISE, Calibration, FarOff
+from amrepair.regions.detection import judged_scales
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.significance import as_normal, as_student
+from amrepair.regions.significance import Tail, as_normal, as_student
+from amrepair.regions.significance import tested as levels_of
+from amrepair.regions.sites import Sites
 from amrepair.scans import Scan
 from tests.analytic import (
     AnalyticTemplate,
@@ -140,11 +142,11 @@ def test_a_small_scan_tells_its_wander_less_surely_than_a_large_one(ball: Analyt
     points = (
         points + np.random.default_rng(0).normal(scale=0.06, size=len(points))[:, None] * normals
     )
-    usual = [
-        float(np.median(level.freedom))
-        for scan, part in ((Scan(points, 0.04, "template"), small), (rough(ball, 0), ball))
-        for level in judged_levels(detect(scan, part))[1:2]
-    ]
+    usual = []
+    for scan, part in ((Scan(points, 0.04, "template"), small), (rough(ball, 0), ball)):
+        sites = detect(scan, part).sites
+        assert sites is not None
+        usual.append(float(np.median(levels_of(sites, RegionOptions(), None)[1].freedom)))
     assert usual[1] > 60.0
     assert usual[0] > 5.0
 
@@ -176,6 +178,46 @@ def test_few_peaks_tell_a_tail_less_surely_than_many() -> None:
     for tail in (few, many):
         z = np.array([tail.exceeded_by(0.01)])
         assert np.exp(tail.log_expected(z)[0]) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("told_by", [6, 30])
+def test_what_few_places_tell_to_lie_far_off_is_exceeded_as_often_as_it_says(told_by: int) -> None:
+    """Depths of normal errors, their spread estimated from so few: 400,000 draws of it."""
+    rng = np.random.default_rng(0)
+    spread_mm = np.sqrt(np.square(rng.normal(0.0, 0.3, (400_000, told_by))).mean(axis=1))
+    for expected in (0.5, 0.02):
+        # a scan has three such places: of one in three, so many exceed what is to be exceeded
+        limit_mm = [FarOff(float(s), 3.0, told_by).exceeded_by(expected) for s in spread_mm[:400]]
+        per_mm = limit_mm[0] / float(spread_mm[0])
+        assert limit_mm == pytest.approx((per_mm * spread_mm[:400]).tolist())
+        new_mm = np.abs(rng.normal(0.0, 0.3, spread_mm.shape))
+        assert 3.0 * (new_mm > per_mm * spread_mm).mean() == pytest.approx(expected, rel=0.1)
+        at = FarOff(0.3, 3.0, told_by)
+        limit = np.array([at.exceeded_by(expected)])
+        assert np.exp(at.log_expected(limit)[0]) == pytest.approx(expected)
+    assert FarOff(0.3, 0.01, told_by).exceeded_by(0.02) == 0.0  # there are fewer at all
+    assert FarOff(0.0, 0.0, 0.0).exceeded_by(0.02) == 0.0
+
+
+def test_what_is_seen_more_aslant_than_anything_that_told_errs_the_more() -> None:
+    """Half of a plane is seen squarely, half at a third of that: the calibration knows the half."""
+    rng = np.random.default_rng(0)
+    across, along = np.meshgrid(np.arange(60) * 0.5, np.arange(60) * 0.5, indexing="ij")
+    place_mm = np.column_stack([across.ravel(), along.ravel(), np.zeros(across.size)])
+    n = len(place_mm)
+    aslant = place_mm[:, 0] > 15.0
+    options = RegionOptions(process_sigma_mm=0.0)
+    sites = Sites(
+        cells=n, cell_mm=0.5, place_mm=place_mm, normal=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        value_mm=rng.normal(0.0, 0.01, n), weight=np.full(n, 4.0),
+        tolerance_mm=np.full((2, n), 0.2), facing=np.where(aslant, 0.3, 0.9), pose_mm=np.zeros(n),
+    )  # fmt: skip
+    known = Calibration("bench", 1, (1.5,), ((0.1,),), ((50.0,),), facing=0.9)
+    for level in levels_of(sites, options, known)[1:2]:
+        far = level.scale.place_mm[:, 0] - 15.0
+        squarely = level.errors.common_mm[far < -5.0]
+        assert squarely == pytest.approx(0.1, rel=0.02)
+        assert level.errors.common_mm[far > 5.0] == pytest.approx(0.3, rel=0.02)
 
 
 def test_windows_are_what_a_plain_loop_makes_of_them() -> None:
@@ -215,8 +257,8 @@ def test_scales_do_not_mix_the_sides_of_a_thin_wall() -> None:
 def test_a_calibration_is_kept_by_name_and_read_again(
     ball: AnalyticTemplate, tmp_path: Path
 ) -> None:
-    levels = [judged_levels(detect(rough(ball, seed), ball)) for seed in (11, 12, 13)]
-    learned = calibrated("bench", levels)
+    sound = [judged_scales(detect(rough(ball, seed), ball)) for seed in (11, 12, 13)]
+    learned = calibrated("bench", sound, RegionOptions())
     learned.save(tmp_path)
     again = Calibration.load("bench", tmp_path)
     assert again == learned
