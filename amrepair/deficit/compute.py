@@ -156,6 +156,7 @@ def compute_deficit(
     """
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
+    template = anomaly.expected(template)
     evidence, lines, by_rays = _evidence_of(scan, template, anomaly, beads, options.skipped)
     deviation_mm = anomaly.deviation_mm
     look = as_built.seen if as_built is not None else partial(

@@ -88,12 +88,34 @@ def shape_columns(place_mm: Points, normal: Points, frame: Frame) -> Float[np.nd
     """
     off = place_mm - frame.centre_mm
     x, n = off @ frame.axes.T, normal @ frame.axes.T
-    h = np.maximum(frame.half_extent_mm, THIN_RATIO * max(float(frame.half_extent_mm[0]), 1e-9))
+    h = _lengths_mm(frame)
     rotation = np.cross(off, normal)  # n·(ω × x) = ω·(x × n)
     scale = np.sum(off * normal, axis=1)
     bends = [x[:, i] * (x[:, i] * n[:, j] - 2 * x[:, j] * n[:, i]) / h[i] ** 2 for i, j in BOWS]
     twist = x[:, 0] * x[:, 1] * n[:, 2] - x[:, 2] * (x[:, 1] * n[:, 0] + x[:, 0] * n[:, 1])
     return np.column_stack([normal, rotation, scale, *bends, twist / (h[0] * h[1])])
+
+
+def bow_moves(
+    place_mm: Points, frame: Frame, bow_mm: Float[np.ndarray, " 4"]
+) -> Float[np.ndarray, "n 3"]:
+    """(n, 3) how far a bow moves places: what `shape_columns` has of it along their normals."""
+    x = (place_mm - frame.centre_mm) @ frame.axes.T
+    h = _lengths_mm(frame)
+    moved = np.zeros_like(x)
+    for sag_mm, (i, j) in zip(bow_mm[:3], BOWS, strict=True):
+        moved[:, j] += sag_mm * x[:, i] ** 2 / h[i] ** 2
+        moved[:, i] -= 2 * sag_mm * x[:, i] * x[:, j] / h[i] ** 2
+    twist = bow_mm[3] / (h[0] * h[1])
+    moved[:, 2] += twist * x[:, 0] * x[:, 1]
+    moved[:, 0] -= twist * x[:, 1] * x[:, 2]
+    moved[:, 1] -= twist * x[:, 0] * x[:, 2]
+    return np.asarray(moved @ frame.axes)
+
+
+def _lengths_mm(frame: Frame) -> Float[np.ndarray, " 3"]:
+    """Half extents that may be divided by."""
+    return np.maximum(frame.half_extent_mm, THIN_RATIO * max(float(frame.half_extent_mm[0]), 1e-9))
 
 
 def priors(

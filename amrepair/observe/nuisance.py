@@ -21,6 +21,7 @@ from amrepair.observe.basis import (
     USUAL_NUISANCE,
     VIEWS_AT,
     Frame,
+    bow_moves,
     priors,
     shape_columns,
 )
@@ -82,9 +83,28 @@ class Nuisance:
         shape = shape_columns(place_mm, normal, self.frame)
         removed_mm = shape @ np.r_[self.twist, self.scale_ratio, self.bow_mm]
         if len(self.view_offset_mm):
-            known = self.view_offset_mm.mean() if view is None else self.view_offset_mm[view]
+            known = self.common_offset_mm if view is None else self.view_offset_mm[view]
             removed_mm = removed_mm + known
         return np.asarray(removed_mm)
+
+    @property
+    def reshapes(self) -> bool:
+        """Whether the observations asked for more than a pose: for size, bow or a common offset."""
+        return bool(self.scale_ratio or self.bow_mm.any() or self.common_offset_mm)
+
+    @property
+    def common_offset_mm(self) -> float:
+        """How far outside all views together say the surface is."""
+        return float(self.view_offset_mm.mean()) if len(self.view_offset_mm) else 0.0
+
+    def moves_mm(self, place_mm: Points) -> Points:
+        """(n, 3) how pose, size and bow move places of the part, not just along their normals."""
+        turned = np.cross(self.twist[3:], np.eye(3))  # rows: how each axis moves
+        off_mm = place_mm - self.frame.centre_mm
+        moved_mm = off_mm @ (turned + self.scale_ratio * np.eye(3)) + self.twist[:3]
+        if self.bow_mm.any():
+            moved_mm += bow_moves(place_mm, self.frame, self.bow_mm)
+        return np.asarray(moved_mm)
 
     def error_mm(self, place_mm: Points, normal: Points) -> Values:
         """(s,) standard error of `removed_mm` by pose, scale and bow: √(J Σ Jᵀ)."""

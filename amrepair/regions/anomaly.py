@@ -10,12 +10,14 @@ from jaxtyping import Float, Int
 
 from amrepair.arrays import Numbers, Points, Values
 from amrepair.field.as_built import Evidence
+from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import Sites
+from amrepair.template.port import Template
 
 
 class Label(IntEnum):
@@ -110,8 +112,8 @@ class AnomalyMap:
     sites
         What the test looked at; None for a map read back from a file.
     noise, nuisance, contradicting
-        What the scan told of its errors, what belongs to the whole part (None where a calibration
-        stood in), and views that were left out.
+        What the scan told of its errors, what belongs to the whole part (None where the pose is
+        told), and views that were left out.
     calibration, options
         What stood in for the scan's own word on its errors, and what the test was set to.
     chance_mm
@@ -141,6 +143,10 @@ class AnomalyMap:
     calibration: Calibration | None = None
     options: RegionOptions | None = None
     chance_mm: float = 0.0
+
+    def expected(self, template: Template) -> Template:
+        """The template that labels and evidence are held against: as the whole part was made."""
+        return as_made(template, self.nuisance)
 
     def told(self) -> tuple[str, ...]:
         """What belongs to the whole part or to whole views, or was not judged, in sentences."""

@@ -103,7 +103,7 @@ def detect(
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, options)
     progress("detect", 3.0, 4.0)
-    regions = find_regions(evidence, test, seen.surface_mm, surface_label, template)
+    regions = find_regions(evidence, test, seen.surface_mm, surface_label, seen.template)
     score = np.abs(seen.f_mm)
     k = min(options.top_k, int(seen.keep.sum()))
     surfel_label = np.where(test.missing, int(Label.MISSING), test.excess * int(Label.EXCESS))

@@ -17,6 +17,7 @@ from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.groups import cell_numbers
 from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import cells_of, diagonal, unit_vectors
+from amrepair.observe.as_made import as_made
 from amrepair.observe.background import ON_PLANE_MM, background
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
@@ -282,7 +283,8 @@ def agreed(
 ) -> tuple[Observed, Sites, Nuisance | None, tuple[Contradiction, ...]]:
     """What was observed without views that contradict the others, and without nuisance.
 
-    What belongs to the whole part or to whole views is told and taken out, unless the pose is told.
+    What belongs to the whole part or to whole views is told and taken out, unless the pose is told:
+    from there on the part is held against the template as it was made.
     """
     out: tuple[Contradiction, ...] = ()
     while True:
@@ -291,13 +293,36 @@ def agreed(
         if pose != "told":
             nuisance, sites, shares = _without_nuisance(seen, sites, pose, options)
         if out or shares is None:
-            return seen, sites, nuisance, out
+            return _as_made(seen, nuisance), sites, nuisance, out
         feet_mm = sites.place_mm[: sites.cells]
         place = cell_numbers(cells_of(feet_mm, 0.0, sites.cell_mm))[shares.place]
         told = replace(shares, place=place)
         out = contradictions(told, point_sigma_mm=seen.surfels.spread_mm)
         if not out:
-            return seen, sites, nuisance, out
+            return _as_made(seen, nuisance), sites, nuisance, out
+
+
+def _as_made(seen: Observed, nuisance: Nuisance | None) -> Observed:
+    """The same against the template as the part was told to have been made: a solid of what stands
+    out from there must not be made against the nominal size.
+    """
+    template = as_made(seen.template, nuisance)
+    if nuisance is None or template is seen.template:
+        return seen
+    surfels = seen.surfels
+    moved_mm = nuisance.removed_mm(surfels.place_mm, seen.outward)
+    points_mm = surfels.point_deviation_mm - np.append(moved_mm, 0.0)[surfels.of_point]
+    deviation_mm = surfels.deviation_mm - moved_mm
+    return replace(
+        seen,
+        template=template,
+        surfels=replace(surfels, deviation_mm=deviation_mm, point_deviation_mm=points_mm),
+        surface_mm=(
+            seen.surface_mm
+            + nuisance.moves_mm(seen.surface_mm)
+            + nuisance.common_offset_mm * seen.normals
+        ),
+    )
 
 
 def _without_nuisance(
