@@ -204,8 +204,11 @@ def stops_of(job: Job, looks: int) -> tuple[Stop, ...]:
 
 def scans_of(
     job: Job, stops: Sequence[Stop], told: WorldParameters, scanner_name: str, seed: int
-) -> Iterator[tuple[Scan, Transform]]:
-    """What a scanner sees at every stop of a job printed without a defect."""
+) -> Iterator[tuple[tuple[Scan, Scan], Transform]]:
+    """What a scanner sees at every stop of a job printed without a defect, and if it looks again.
+
+    Its errors are drawn anew for another look. Those of a real one may be the same.
+    """
     beads = job.beads
     part = beads.layer >= 0
     low, high = beads.start_mm[part].min(axis=0), beads.start_mm[part].max(axis=0)
@@ -219,8 +222,11 @@ def scans_of(
         middle_mm=CENTRE_MM,
     )
     rng, flow_rng = np.random.default_rng([seed, 2]), np.random.default_rng([seed, 3])
-    scanner = SimulatedScanner.seeded(
-        world, told, scanner_name, centre_mm=CENTRE_MM, high_mm=float(high[2]), rng=rng
+    scanner, again = (
+        SimulatedScanner.seeded(
+            world, told, scanner_name, centre_mm=CENTRE_MM, high_mm=float(high[2]), rng=drawn
+        )
+        for drawn in (rng, np.random.default_rng([seed, 4]))
     )
     done = -1
     for stop in stops:
@@ -228,18 +234,18 @@ def scans_of(
         if layer > done:
             world.deposit(noisy_flow(motion_of(job, done + 1, layer), flow_rng, told.flow))
             done = layer
-        scan = scanner.scan(ScanRequest(stop.label, stop.layer_index, stop.z_mm))
-        yield scan, scanner.build_from_scanner
+        asked = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
+        yield (scanner.scan(asked), again.scan(asked)), scanner.build_from_scanner
 
 
 def kept_scans(
-    path: Path, make: Callable[[], Iterator[tuple[Scan, Transform]]]
-) -> list[tuple[Scan, Transform]]:
+    path: Path, make: Callable[[], Iterator[tuple[tuple[Scan, Scan], Transform]]]
+) -> list[tuple[tuple[Scan, Scan], Transform]]:
     """Those of an earlier call, or new ones, kept."""
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(pickle.dumps(list(make())))
-    found: list[tuple[Scan, Transform]] = pickle.loads(path.read_bytes())
+    found: list[tuple[tuple[Scan, Scan], Transform]] = pickle.loads(path.read_bytes())
     return found
 
 
@@ -272,27 +278,29 @@ def figures(
 
 
 def judged(
-    scan: Scan,
+    scans: Sequence[Scan],
     pose: Transform,
     job: Job,
     site: Site,
     stop: Stop,
     *,
     rng: np.random.Generator,
-    learning: Learning | None = None,
+    learning: Learning,
 ) -> dict[str, Any]:
-    """What the loop decides of a scan, and what it learns of the scanner."""
-    site = site if learning is None else learning.judged_by(site)
+    """What the loop decides of a scan, or of another where it looks again; and learns of them."""
     placed = site.build_from_template
     assert placed is not None
-    plan = plan_repair(
-        scan, site, title=stop.label, guess=placed.inverse() @ pose, strict=False,
-        interruption=job.state_after(stop.line), rng=rng,
-    )  # fmt: skip
-    plan = typed(plan, job, site, stop.line, pose)
-    decision = decide_look(plan, job, site, stop, (), seen_twice=False, limits=None)
-    if learning is not None:
+    for twice, scan in enumerate(scans):
+        site = learning.judged_by(site)
+        plan = plan_repair(
+            scan, site, title=stop.label, guess=placed.inverse() @ pose, strict=False,
+            interruption=job.state_after(stop.line), rng=rng,
+        )  # fmt: skip
+        plan = typed(plan, job, site, stop.line, pose)
+        decision = decide_look(plan, job, site, stop, (), seen_twice=bool(twice), limits=None)
         learning.note(stop, plan, decision)
+        if decision.action is not Action.LOOK_AGAIN:
+            break
     changed = None
     if decision.changes_next and stop.layer_index is not None:
         after = stop.layer_index + 1
@@ -301,6 +309,7 @@ def judged(
         "action": str(decision.action),
         "repair_mm3": round(sum(r.volume_mm3 for r in plan.to_fill), 2),
         "halted": decision.action in HALTS,
+        "twice": bool(twice),
     }
 
 
@@ -318,14 +327,16 @@ def run_job(
     placed = locate_part(job, template, layer_height_mm=layer_mm)
     site_at = sites(job, template, placed, setup)
     scanner = Path(scanner_name).name  # of a recording, its file's
-    kept = folder / f"{Path(part).stem}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner}.pickle"
+    kept = (
+        folder / f"{Path(part).stem}-{way}-{looks}-{seed}-{told.sha256[:8]}-{scanner}-twice.pickle"
+    )
     scans = kept_scans(kept, lambda: scans_of(job, stops, told, scanner_name, seed))
     seen, learning = [], Learning()
-    for number, (stop, (scan, pose)) in enumerate(zip(stops, scans, strict=True), start=1):
+    for number, (stop, (both, pose)) in enumerate(zip(stops, scans, strict=True), start=1):
         site = site_at(stop)
         try:
             row = judged(
-                scan, pose, job, site, stop,
+                both, pose, job, site, stop,
                 rng=np.random.default_rng([seed, number]), learning=learning,
             )  # fmt: skip
         except AlignmentError as error:  # twice in a row, and the loop ends
@@ -343,7 +354,7 @@ def run_job(
 
 
 def counts(rows: Sequence[dict[str, Any]]) -> tuple[int, ...]:
-    """Looks, repairs, looks that claim much excess, changes of flow, halts."""
+    """Stops, repairs, claims of much excess, changes of flow, halts, and looks taken again."""
     looks = [look for row in rows for look in row["looks"]]
     return (
         len(looks),
@@ -351,6 +362,7 @@ def counts(rows: Sequence[dict[str, Any]]) -> tuple[int, ...]:
         sum(look["excess_mm3"] > MUCH_EXCESS_MM3 for look in looks),
         sum(look["flow_mm3"] is not None for look in looks),
         sum(look["halted"] for look in looks),
+        sum(look.get("twice", False) for look in looks),
     )
 
 
@@ -358,8 +370,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown: by part, by way and in all; then where each false alarm is."""
     lines = [
         f"| jobs | looks | repairs | excess > {MUCH_EXCESS_MM3:g} mm³ | flow changed | halts "
-        "| missing, most mm³ | excess, most mm³ |",
-        "|---|---|---|---|---|---|---|---|",
+        "| looked twice | missing, most mm³ | excess, most mm³ |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     names = dict.fromkeys(row["job"].rsplit(":", 1)[0] for row in rows)
     for word in (*names, *WAYS, "all"):

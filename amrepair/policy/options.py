@@ -30,7 +30,7 @@ class PolicyOptions:
     excess_layers
         Standing out less than this, material is ploughed by the layers after it.
     sure
-        Confidence from which a run is ended without asking first.
+        Confidence from which a run is ended, or halted, without another look.
     doubtful
         Confidence below which another look is taken.
     thin_layers

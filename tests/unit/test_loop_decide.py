@@ -37,6 +37,7 @@ CASES = {
     "F0b": replace(VOID, object="lid", lost_ratio=0.7),
     "F0c": replace(VOID, object="lid", lost_ratio=0.7, seen_twice=True),
     "F3a": replace(VOID, type=DefectType.WARP, object="lid"),
+    "F3b": replace(BLOB, hit_mm=0.4, confidence=0.8),
     "F4a": replace(BLOB, hit_mm=0.4, object="lid"),
     "F1": replace(VOID, type=DefectType.DETACHED),
     "F2": replace(VOID, type=DefectType.LAYER_SHIFT, confidence=0.5),
@@ -105,6 +106,14 @@ def test_the_gravest_counts_and_the_thin_waits_for_the_next_layer() -> None:
     assert decision.action is Action.FILL_WITH_NEXT
     assert decision.row == "S6, S10"
     assert {v.row for v in decision.changes_next} == {"F11b", "F6"}
+
+
+def test_what_is_not_surely_in_the_heads_way_is_looked_at_twice_before_the_print_halts() -> None:
+    unsure = CASES["F3b"]
+    assert judge(unsure).action is Action.LOOK_AGAIN
+    again = replace(unsure, seen_twice=True)
+    assert judge(again).action is Action.PAUSE
+    assert judge(replace(again, object="lid")).action is Action.GIVE_UP
 
 
 def test_a_speck_in_the_heads_way_does_not_end_a_print() -> None:
