@@ -25,10 +25,10 @@ from amrepair.bench.bodies import pieces_of, surface_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
 from amrepair.bench.options import USUAL_HOUSE
+from amrepair.bench.sound_test import SoundTest, SoundTestOptions
 from amrepair.errors import AlignmentError
 from amrepair.frames import diagonal, moved
 from amrepair.merge import fit_from_scans
-from amrepair.regions.sound import SoundTest, SoundTestOptions
 from amrepair.scans.scan import Scan
 from amrepair.template import (
     GridSdf,

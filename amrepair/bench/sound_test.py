@@ -1,10 +1,11 @@
 """The test where sound scans of the part are at hand: how surely a scan is not one of them.
 
-As in `significance`: means over windows on several scales, each in standard errors, and the number
-of false windows expected as far out, by the tail of what sound places leave. But nothing of the
-null has to be told by the scan that is judged, so no median must guard it against its own defects:
-the sound scans tell the bias by place, what they differ by there, and the tail, each judged by the
-others. Means find what fills a fraction of a window, and windows go down to single cells.
+As in `regions.significance`: means over windows on several scales, each in standard errors, and
+the number of false windows expected as far out, by the tail of what sound places leave. But nothing
+of the null has to be told by the scan that is judged, so no median must guard it against its own
+defects: the sound scans tell the bias by place, what they differ by there, and the tail, each
+judged by the others. Means find what fills a fraction of a window, and windows go down to single
+cells.
 """
 
 from __future__ import annotations

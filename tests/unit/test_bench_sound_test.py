@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
+from amrepair.bench.sound_test import SoundTest, SoundTestOptions
 from amrepair.errors import InputError
-from amrepair.regions.sound import SoundTest, SoundTestOptions
 from amrepair.template import GridSdf, MeshSdf
 from amrepair.template.fit import fit_fast
 from amrepair.template.grid import Coverage
