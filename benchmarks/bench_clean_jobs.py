@@ -222,11 +222,8 @@ def scans_of(
         middle_mm=CENTRE_MM,
     )
     rng, flow_rng = np.random.default_rng([seed, 2]), np.random.default_rng([seed, 3])
-    scanner, again = (
-        SimulatedScanner.seeded(
-            world, told, scanner_name, centre_mm=CENTRE_MM, high_mm=float(high[2]), rng=drawn
-        )
-        for drawn in (rng, np.random.default_rng([seed, 4]))
+    scanner = SimulatedScanner.seeded(
+        world, told, scanner_name, centre_mm=CENTRE_MM, high_mm=float(high[2]), rng=rng
     )
     done = -1
     for stop in stops:
@@ -235,7 +232,7 @@ def scans_of(
             world.deposit(noisy_flow(motion_of(job, done + 1, layer), flow_rng, told.flow))
             done = layer
         asked = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
-        yield (scanner.scan(asked), again.scan(asked)), scanner.build_from_scanner
+        yield (scanner.scan(asked), scanner.scan(asked)), scanner.build_from_scanner
 
 
 def kept_scans(
@@ -429,7 +426,7 @@ def main() -> None:
         rows.append(row)
         with args.results.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        print(name, dict(zip(("looks", "repairs", "much", "flow", "halts"), counts([row]),
+        print(name, dict(zip(("looks", "repairs", "much", "flow", "halts", "twice"), counts([row]),
               strict=True)), row["seconds"], "s", flush=True)  # fmt: skip
     print(table([row for row in rows if row["job"] in args.jobs]))
 
