@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtr, stdtrit
 
 from amrepair.arrays import Values
 from amrepair.errors import InputError
@@ -53,12 +53,13 @@ class FarOff:
         if not self.spread_mm:
             return np.full(len(beyond_mm), -np.inf)
         ratio = np.maximum(beyond_mm, 0.0) / self.spread_mm
-        return np.asarray(np.log(2.0 * self.places) + t.logsf(ratio, self.told_by))
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(2.0 * self.places * stdtr(self.told_by, -ratio)))
 
     def exceeded_by(self, expected: float) -> float:
         """Beyond which depth, mm, a scan has so many such places; 0 where it has fewer at all."""
         share = 0.5 * min(expected / self.places, 1.0) if self.spread_mm else 0.5
-        return self.spread_mm * float(t.isf(share, self.told_by)) if share < 0.5 else 0.0
+        return -self.spread_mm * float(stdtrit(self.told_by, share)) if share < 0.5 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
