@@ -9,14 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
-from amrepair.regions.calibration import Calibration, FarOffTold
+from amrepair.regions.calibration import HALF_OCTAVE, Calibration, FarOffTold
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import LEAST_PEAKS, Level
 
 # Of no such place at all.
 NONE_FAR_OFF: FarOffTold = (0.0, 0.0, 0.0)
-# Windows are twice as wide from scale to scale: half of that to either side.
-HALF_OCTAVE = 0.5
 
 
 @dataclass(frozen=True, slots=True)

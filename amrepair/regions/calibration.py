@@ -22,6 +22,8 @@ CALIBRATION_VERSION = 4
 
 
 FarOffTold = tuple[float, float, float]
+# Windows are twice as wide from scale to scale: by half of that widths are told apart.
+HALF_OCTAVE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +100,7 @@ class Calibration:
         """
         if not self.width_mm:
             return np.zeros(classes), np.full(classes, np.inf)
-        row = self._nearest(width_mm)
+        row = self._row(width_mm)
         known = np.minimum(np.arange(classes), len(self.wander_mm[row]) - 1)
         return np.array(self.wander_mm[row])[known], np.array(self.freedom[row])[known]
 
@@ -106,13 +108,17 @@ class Calibration:
         """What lies far off of so many windows; without a width, of three cells together."""
         if not self.far_off:
             return FarOff(0.0, 0.0, 0.0)
-        row = 0 if width_mm is None else 1 + self._nearest(width_mm)
+        row = 0 if width_mm is None else 1 + self._row(width_mm)
         spread_mm, rate, told_by = self.far_off[row][side]
         return FarOff(spread_mm, rate * windows, told_by)
 
-    def _nearest(self, width_mm: float) -> int:
-        """The width that is known and most alike."""
-        return int(np.argmin(np.abs(np.log(np.array(self.width_mm) / width_mm))))
+    def _row(self, width_mm: float) -> int:
+        """The widest that is known and no wider, to half of what widths are told apart by.
+
+        Narrower windows err more: what lies far off there fills part of a wider one.
+        """
+        as_wide = np.array(self.width_mm) <= width_mm * 2.0 ** (0.5 * HALF_OCTAVE)
+        return max(int(as_wide.sum()) - 1, 0)
 
     def told(self) -> str:
         """Whose errors they are, in a sentence."""
