@@ -44,13 +44,18 @@ def template() -> MeshSdf:
 
 @pytest.fixture(scope="module")
 def plate() -> MeshSdf:
-    """A third of the other's material, where one defect is enough."""
-    return MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (15, 12, 2.0))))
+    """A quarter of the other's material, where one defect is enough."""
+    return MeshSdf.from_mesh(trimesh.creation.box(bounds=((0, 0, 0), (12, 10, 2.0))))
 
 
 def prepared(template: MeshSdf, *defects: str, process: str = "repair_0.20") -> PreparedRun:
     parsed = [parse_defect(text) for text in defects]
     return prepare_run(template, load_setup(process=process), parsed, title="test", seed=3)
+
+
+@pytest.fixture(scope="module")
+def sound(template: MeshSdf) -> PreparedRun:
+    return prepared(template)
 
 
 def result_of(run: SimulatedRun) -> dict[str, object]:
@@ -213,22 +218,21 @@ def test_the_nozzle_is_back_where_the_job_left_it_before_it_goes_on(
     assert "E" in way[2]
 
 
-def test_the_part_is_found_in_its_job(template: MeshSdf) -> None:
-    run = prepared(template)
-    placed = locate_part(run.job, template, layer_height_mm=0.2)
+def test_the_part_is_found_in_its_job(sound: PreparedRun, template: MeshSdf) -> None:
+    placed = locate_part(sound.job, template, layer_height_mm=0.2)
     corners = template.bounds_mm
-    truth = run.build_from_template.apply(corners)
+    truth = sound.build_from_template.apply(corners)
     assert np.abs(placed.apply(corners) - truth).max() < 0.03
 
 
-def test_another_part_is_not_found_in_the_job(template: MeshSdf) -> None:
+def test_another_part_is_not_found_in_the_job(sound: PreparedRun) -> None:
     other = MeshSdf.from_mesh(trimesh.creation.box((30.0, 18.0, 6.0)))
     with pytest.raises(AlignmentError):
-        locate_part(prepared(template).job, other, layer_height_mm=0.2)
+        locate_part(sound.job, other, layer_height_mm=0.2)
 
 
-def test_stops_are_after_layers_that_there_are(template: MeshSdf) -> None:
-    job = prepared(template).job
+def test_stops_are_after_layers_that_there_are(sound: PreparedRun) -> None:
+    job = sound.job
     stops = plan_stops(job, [5, 3, 5])
     assert [stop.layer_index for stop in stops] == [3, 5, None]
     assert stops[0].line == job.layers[4].first_line

@@ -32,7 +32,7 @@ def sloped(slope_deg: float) -> m3.Manifold:
 
 def lost(block: m3.Manifold, depth_mm: float = 0.6) -> m3.Manifold:
     """A hollow as deep everywhere."""
-    tool = m3.Manifold.cube((14.0, 12.0, 40.0)).translate((68.0, 69.0, 0.0))
+    tool = m3.Manifold.cube((10.0, 8.0, 40.0)).translate((70.0, 71.0, 0.0))
     return (block ^ tool) - block.translate((0.0, 0.0, -depth_mm))
 
 

@@ -26,6 +26,14 @@ def modules() -> list[tuple[str, ast.Module]]:
     ]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _read_no_more() -> Iterator[None]:
+    """A million nodes, which Python's collector of circles would look through ever after."""
+    yield
+    modules.cache_clear()
+    shape.cache_clear()
+
+
 def constants(module: ast.Module) -> Iterator[tuple[str, ast.expr]]:
     """Names in capitals that a module sets, and those of a tuple."""
     for node in module.body:

@@ -350,12 +350,12 @@ def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
 @pytest.mark.parametrize("moved_mm", [0.0, -0.1])
 def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) -> None:
     """regression: a dome's were told moved by 0.1 mm, and its flanks not looked at in the end."""
-    foot = m3.CrossSection.circle(13.4, 96)
-    part = foot.extrude(1.5) + foot.extrude(7.0, scale_top=(0.3, 0.3)).translate((0.0, 0.0, 1.4))
+    foot = m3.CrossSection.circle(9.0, 48)
+    part = foot.extrude(1.0) + foot.extrude(4.7, scale_top=(0.3, 0.3)).translate((0.0, 0.0, 0.9))
     less = foot.offset(moved_mm)
-    laid = less.extrude(1.5) + less.extrude(
-        7.0, scale_top=((4.02 + moved_mm) / (13.4 + moved_mm),) * 2
-    ).translate((0.0, 0.0, 1.4))
+    laid = less.extrude(1.0) + less.extrude(
+        4.7, scale_top=((2.7 + moved_mm) / (9.0 + moved_mm),) * 2
+    ).translate((0.0, 0.0, 0.9))
     job = job_of(laid.translate((100.0, 90.0, 0.0)))
     template = MeshSdf.from_mesh(solid_mesh(part))
     placed = locate_part(job, template, layer_height_mm=LAYER_MM)
