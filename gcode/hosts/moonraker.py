@@ -128,7 +128,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
 
     def _upload(self, job: JobFile) -> None:
         """Put the file on the server, which compares its checksum."""
-        self._session.expect(
+        self._session.web.expect(
             201,
             "take the file; is its disk full?",
             "POST",
@@ -227,7 +227,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
 
     def emergency_stop(self) -> None:
         """Stop Klipper now, by its own endpoint; FIRMWARE_RESTART it afterwards."""
-        answer = self._session.request("POST", "/printer/emergency_stop")
+        answer = self._session.web.request("POST", "/printer/emergency_stop")
         if answer.status_code != 200:
             raise LinkError(
                 f"{self.address.name} refuses the emergency stop ({sentence(answer)}): switch the "

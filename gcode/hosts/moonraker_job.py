@@ -129,13 +129,8 @@ class KlipperJob(ServedJob[MoonrakerSession], MoonrakerPrinter):
             return None
         if state.outcome == "cancelled":
             return False
-        if state.outcome == "complete" and end >= self._text.lines:
-            return True
         if state.outcome == "complete":
-            raise LinkError(
-                f"the print of {self._name} ended and never rested at the look before line "
-                f"{end + 1}; is amrepair.cfg included in printer.cfg?"
-            )
+            return self._complete(end, "is amrepair.cfg included in printer.cfg?")
         why = state.klippy_message if state.stopped else state.message
         raise PrinterError(f"{self.address.name} reports a fault: {cause_of(why)[:200]}")
 

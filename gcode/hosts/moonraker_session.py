@@ -40,7 +40,7 @@ class MoonrakerSession(ServerSession[KlippyState]):
 
     def listen(self) -> None:
         """Open the websocket and say who we are."""
-        self._client.get("/server/info")  # tells an unreachable server from a refused key
+        self.web.get("/server/info")  # tells an unreachable server from a refused key
         self._open_socket("/websocket", dict(self._key.headers))
         who = {"client_name": "gcode", "version": gcode.__version__, "type": "other", "url": "-"}
         if self._agent:
@@ -129,7 +129,7 @@ class MoonrakerSession(ServerSession[KlippyState]):
 
     def listed(self, path: str, **query: str) -> list[dict[str, Any]]:
         """Return the objects of an HTTP answer's result, one or many."""
-        answer = self.request("GET", path, params=query)
+        answer = self.web.request("GET", path, params=query)
         result = (json_object(answer) or {}).get("result") if answer.status_code == 200 else None
         if isinstance(result, dict):
             result = [result]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gcode.hosts.unknown import UnknownCommands
+from gcode.hosts.web import part_of
 
 MOONRAKER_ENDS = ("complete", "cancelled", "error")
 STOPPED = ("shutdown", "error")
@@ -98,7 +99,7 @@ class KlippyState:
 
     def take_status(self, status: dict[str, Any]) -> None:
         """Take objects of Klipper, whole or what changed of them."""
-        hooks, stats = _object(status, "webhooks"), _object(status, "print_stats")
+        hooks, stats = part_of(status, "webhooks"), part_of(status, "print_stats")
         self.klippy = str(hooks.get("state", self.klippy))
         self.klippy_message = str(hooks.get("state_message", self.klippy_message))
         self.print_file = str(stats.get("filename", self.print_file))
@@ -108,7 +109,7 @@ class KlippyState:
             return
         if self.print_state in MOONRAKER_ENDS and not self.outcome:
             self.outcome = self.print_state
-        position = _object(status, "virtual_sdcard").get("file_position")
+        position = part_of(status, "virtual_sdcard").get("file_position")
         if isinstance(position, int) and position > self.file_position:  # 0 again once it ended
             self.file_position, self.moved = position, True
 
@@ -121,8 +122,3 @@ class KlippyState:
 def cause_of(text: str) -> str:
     """What Klipper says in one line, without what it says of every shutdown."""
     return " ".join(text.partition("Once the underlying issue")[0].split()).rstrip(".")
-
-
-def _object(status: dict[str, Any], name: str) -> dict[str, Any]:
-    found = status.get(name)
-    return found if isinstance(found, dict) else {}

@@ -12,12 +12,12 @@ from collections.abc import Callable
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.octoprint_session import OctoPrintSession
-from gcode.hosts.octoprint_state import BUSY_STATES, part_of
+from gcode.hosts.octoprint_state import BUSY_STATES
 from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
 from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import LIFT_COMMANDS, sentence
+from gcode.hosts.web import LIFT_COMMANDS, part_of, sentence
 from gcode.protocol import events as ev
 
 
@@ -35,7 +35,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         return OctoPrintSession(reach)
 
     def _greet(self, ready: Callable[[], None]) -> None:
-        if "Moonraker" in str(self._session.get("/api/version").get("text")):
+        if "Moonraker" in str(self._session.web.get("/api/version").get("text")):
             raise LinkError(
                 f"{self.address.base} is a Moonraker that answers as OctoPrint; write "
                 f"moonraker+{self.address.base}."
@@ -44,7 +44,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self._session.listen()
 
     def _left(self, prefix: str) -> Left | None:
-        rows = self._session.get(self.files).get("files")
+        rows = self._session.web.get(self.files).get("files")
         mine = [r for r in rows or () if str(r.get("path")).startswith(prefix)]
         if not mine:
             return None
@@ -135,7 +135,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def _upload(self, job: JobFile) -> None:
         """Put the file on the server and compare what lies there."""
-        self._session.expect(
+        self._session.web.expect(
             201,
             "take the file; is its disk full?",
             "POST",
@@ -143,7 +143,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
             files={"file": (job.name, job.data)},
             timeout_s=self._timing.upload_s,
         )
-        there = self._session.get(f"{self.files}/{job.name}")
+        there = self._session.web.get(f"{self.files}/{job.name}")
         size, digest = there.get("size"), there.get("hash")
         if size != len(job.data) or digest not in {None, job.sha1}:
             raise LinkError(
@@ -155,7 +155,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self._resends_before = self._session.state.resends
         self._session.state.follow(job.name)
         try:
-            answer = self._session.request(
+            answer = self._session.web.request(
                 "POST", f"{self.files}/{job.name}", json={"command": "select", "print": True}
             )
         except LinkError as error:
@@ -210,13 +210,13 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         self._job({"command": "pause", "action": "resume"}, "resume")
 
     def _job(self, command: dict[str, str], what: str) -> None:
-        self._session.expect(204, what, "POST", "/api/job", json=command)
+        self._session.web.expect(204, what, "POST", "/api/job", json=command)
 
     def abort(self) -> None:
         """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
         if self._open is None:
             return
-        answer = self._session.request("POST", "/api/job", json={"command": "cancel"})
+        answer = self._session.web.request("POST", "/api/job", json={"command": "cancel"})
         if answer.status_code == 204:
             self._await_rest()
         self.heaters_off()

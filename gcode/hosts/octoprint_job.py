@@ -25,12 +25,11 @@ from gcode.hosts.job_text import JobText
 from gcode.hosts.modes import commands_of
 from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.octoprint_session import OctoPrintSession
-from gcode.hosts.octoprint_state import part_of
 from gcode.hosts.port import NothingMetError, PrintableProgram
 from gcode.hosts.rewritten import Rewritten
 from gcode.hosts.served_job import AGENT, ServedJob, UnderWay, number_of
 from gcode.hosts.server import ServerReach
-from gcode.hosts.web import LIFT_COMMANDS, json_object, sentence
+from gcode.hosts.web import LIFT_COMMANDS, json_object, part_of, sentence
 from gcode.progress import Progress, silent
 
 PLUGIN = f"/plugin/{AGENT}"
@@ -71,7 +70,7 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
             If the plugin refuses.
         """
         body = {"agent": self._id, **said}
-        answer = self._session.request("POST", f"{PLUGIN}/{what}", json=body)
+        answer = self._session.web.request("POST", f"{PLUGIN}/{what}", json=body)
         if answer.status_code == 404:
             raise LinkError(
                 f"{self.address.name} has no amrepair plugin; install amrepair into OctoPrint's "
@@ -217,13 +216,8 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
             return None
         if ended == "cancelled":
             return False
-        if ended == "done" and end >= self._text.lines:
-            return True
         if ended == "done":
-            raise LinkError(
-                f"the print of {self._name} ended and never rested at the look before line "
-                f"{end + 1}; are lines with @ taken out of it?"
-            )
+            return self._complete(end, "are lines with @ taken out of it?")
         raise PrinterError(f"{self.address.name}: the print of {self._name} failed ({ended})")
 
     # ------------------------------------------------------------------ at rest

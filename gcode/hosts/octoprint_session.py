@@ -15,9 +15,9 @@ from typing import Any
 import httpx
 
 from gcode.errors import LinkError
-from gcode.hosts.octoprint_state import ServerState, part_of
+from gcode.hosts.octoprint_state import ServerState
 from gcode.hosts.server import ServerReach, ServerSession
-from gcode.hosts.web import json_object, sentence
+from gcode.hosts.web import json_object, part_of, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -43,13 +43,9 @@ class OctoPrintSession(ServerSession[ServerState]):
         super().__init__(reach, ServerState(plugin=plugin))
         self._asking = threading.Lock()
 
-    def get(self, path: str) -> dict[str, Any]:
-        """Return an answer's JSON object."""
-        return self._client.get(path)
-
     def listen(self) -> None:
         """Open the push socket: a login for the session, then the subscription."""
-        answer = self._client.request("POST", "/api/login", json={"passive": True})
+        answer = self.web.request("POST", "/api/login", json={"passive": True})
         user = (json_object(answer) or {}) if answer.status_code == 200 else {}
         if not user.get("session"):
             raise LinkError(
@@ -80,9 +76,9 @@ class OctoPrintSession(ServerSession[ServerState]):
         LinkError
             If the server's printer is not operational.
         """
-        answer = self._client.request("GET", "/api/printer", params={"exclude": "sd"})
+        answer = self.web.request("GET", "/api/printer", params={"exclude": "sd"})
         if answer.status_code != 200:
-            job = self._client.get("/api/job")
+            job = self.web.get("/api/job")
             raise LinkError(
                 f"The printer of {self.address.name} is not operational (it says "
                 f"{str(job.get('state', 'nothing'))!r}); connect it there first."
@@ -103,7 +99,7 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def printing(self) -> tuple[str, float]:
         """Return what is printed there, and how far it is, per cent."""
-        report = self.get("/api/job")
+        report = self.web.get("/api/job")
         done = part_of(report, "progress").get("completion")
         name = part_of(part_of(report, "job"), "file").get("name")
         return str(name), float(done) if isinstance(done, int | float) else 0.0
@@ -118,9 +114,9 @@ class OctoPrintSession(ServerSession[ServerState]):
         if not self.listening:
             self.listen()
         # The flags are asked first: a print that ends in between is then under way, not lost.
-        answer = self.request("GET", "/api/printer", params={"exclude": "temperature,sd"})
+        answer = self.web.request("GET", "/api/printer", params={"exclude": "temperature,sd"})
         flags = self._flags(answer)
-        report = self.get("/api/job")
+        report = self.web.get("/api/job")
         with self.news:
             return self.state.look(report, flags)
 
@@ -166,7 +162,7 @@ class OctoPrintSession(ServerSession[ServerState]):
 
     def command(self, *commands: str) -> None:
         """Have commands sent, in turn with whatever else is sent; does not wait."""
-        self.expect(
+        self.web.expect(
             204,
             f"send {', '.join(commands)}; is its printer connected?",
             "POST",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gcode.hosts.unknown import UnknownCommands
+from gcode.hosts.web import part_of
 
 OCTOPRINT_ENDS = ("PrintDone", "PrintFailed", "PrintCancelled")
 BUSY_STATES = ("printing", "paused", "pausing", "resuming", "cancelling", "finishing")
@@ -141,12 +142,6 @@ class ServerState:
             self.outcome = "PrintDone"
             return True
         return False
-
-
-def part_of(news: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return an object in an object, an empty one where it is none."""
-    found = news.get(name)
-    return found if isinstance(found, dict) else {}
 
 
 def _path(news: dict[str, Any]) -> str:

@@ -143,7 +143,7 @@ class ServedJob(ServerPrinter[Session]):
 
     def fetch(self, name: str) -> bytes:
         """A job's file as it lies on the server."""
-        answer = self._session.request("GET", f"{self._downloads}/{quote(name)}")
+        answer = self._session.web.request("GET", f"{self._downloads}/{quote(name)}")
         if answer.status_code != 200:
             raise LinkError(f"{self.address.name} does not give the file {name!r} out.")
         return bytes(answer.content)
@@ -253,6 +253,15 @@ class ServedJob(ServerPrinter[Session]):
             with self._session.news:
                 if not self._pending():
                     self._session.news.wait(self._timing.poll_s)
+
+    def _complete(self, end: int, hint: str) -> bool:
+        """Whether a print that is over was to end there; refused where a look was to come."""
+        if end < self._text.lines:
+            raise LinkError(
+                f"the print of {self._name} ended and never rested at the look before line "
+                f"{end + 1}; {hint}"
+            )
+        return True
 
     # ------------------------------------------------------------------ a run gone on with
 

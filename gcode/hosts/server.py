@@ -18,8 +18,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Literal, Protocol, Self, TypeVar, runtime_checkable
 
-import httpx
-
 from gcode.errors import LinkError, LocalProtocolError
 from gcode.hosts.lock import PortLock
 from gcode.hosts.port import LinkLostError, PrintableProgram, Printer, PrintReport
@@ -74,6 +72,8 @@ class ServerSession(ABC, Generic[State]):
 
     Attributes
     ----------
+    web
+        What HTTP requests go by.
     news
         Notified whenever `state` may have changed; hold it to read several fields at once.
     """
@@ -84,28 +84,18 @@ class ServerSession(ABC, Generic[State]):
         self.news = threading.Condition()
         self._key, self._timing = reach.key, reach.timing
         self._clock, self._log = reach.clock, reach.log
-        self._client = WebClient(reach.address, reach.key, reach.timing, reach.log)
+        self.web = WebClient(reach.address, reach.key, reach.timing, reach.log)
         self._socket: PushSocket | None = None
 
     def close(self) -> None:
         """Hang up."""
         self._hang_up()
-        self._client.close()
+        self.web.close()
 
     @property
     def listening(self) -> bool:
         """Whether news can reach us."""
         return self._socket is not None and self._socket.alive
-
-    def request(self, method: str, path: str, **kwargs: Any) -> httpx.Response:
-        """Send an HTTP request once; see `WebClient.request`."""
-        return self._client.request(method, path, **kwargs)
-
-    def expect(
-        self, status: int, otherwise: str, method: str, path: str, **kwargs: Any
-    ) -> httpx.Response:
-        """Send an HTTP request that is not to be refused; see `WebClient.expect`."""
-        return self._client.expect(status, otherwise, method, path, **kwargs)
 
     @property
     def is_told(self) -> bool:
@@ -364,7 +354,7 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
     def _delete(self, name: str) -> None:
         """Take a file off the server; refused if it is held: harmless."""
         if name:
-            self._session.request("DELETE", f"{self.files}/{name}")
+            self._session.web.request("DELETE", f"{self.files}/{name}")
 
     def _report(
         self, checked: PrintableProgram, job: JobFile, start_s: float, *, ok: bool

@@ -329,6 +329,12 @@ def json_object(answer: httpx.Response) -> dict[str, Any] | None:
     return body if isinstance(body, dict) else None
 
 
+def part_of(told: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return an object in an object, an empty one where it is none."""
+    found = told.get(name)
+    return found if isinstance(found, dict) else {}
+
+
 def sentence(answer: httpx.Response) -> str:
     """Return what a server says of an error, shortened."""
     error = (json_object(answer) or {}).get("error", "")
