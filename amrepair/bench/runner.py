@@ -66,7 +66,6 @@ def run_bench(
     out: Path,
     jobs: int = 1,
     seeds: Sequence[int] = DEFAULT_SEEDS,
-    classes: Sequence[str] | None = None,
     checkpoint: Path | None = None,
     paper: PaperOptions = BENCH_PAPER,
     progress: Progress = silent,
@@ -87,8 +86,6 @@ def run_bench(
         Processes; each does whole cells.
     seeds
         Registration and banks are random: three by default, their spread is reported.
-    classes
-        Only these; None takes all.
     checkpoint
         Pretrained weights, for the methods that need them.
     paper
@@ -108,34 +105,23 @@ def run_bench(
     names = list(dict.fromkeys(methods))
     for name in names:
         make_method(name, checkpoint=checkpoint, paper=paper)
-    chosen = _choose(data, classes)
     out = Path(out)
     _claim(out, data, paper if PAPER_METHOD in names else None)
     cells = [
         Cell(method, one, data.format, seed, out, checkpoint, paper)
-        for one in chosen.classes
+        for one in data.classes
         for method in names
         for seed in dict.fromkeys(seeds)
     ]
     rows: list[ScoreRow] = []
     for row in _work(cells, jobs, progress):
         rows.append(row)
-        report = _write(out, chosen, rows, len(cells), paper)
+        report = _write(out, data, rows, len(cells), paper)
         progress("bench", float(len(rows)), float(len(cells)))
     shutil.rmtree(out / "partial", ignore_errors=True)
     for draft in list(left_behind(out)):  # what a killed run was writing
         draft.unlink(missing_ok=True)
     return report
-
-
-def _choose(data: BenchData, classes: Sequence[str] | None) -> BenchData:
-    if classes is None:
-        return data
-    known = {one.name: one for one in data.classes}
-    missing = [name for name in classes if name not in known]
-    if missing:
-        raise InputError(f"no class {missing[0]!r} in the data set; there are {', '.join(known)}")
-    return BenchData(data.format, data.root, tuple(known[name] for name in sorted(set(classes))))
 
 
 def _claim(out: Path, data: BenchData, paper: PaperOptions | None) -> None:

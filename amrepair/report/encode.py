@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import manifold3d
 import numpy as np
+import trimesh
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
@@ -17,7 +18,6 @@ from amrepair.align.thinning_kernels import morton_keys
 from amrepair.arrays import Numbers, Points
 from amrepair.report.data import SolidMesh
 from amrepair.report.options import USUAL_PAGE
-from amrepair.template.surface import triangle_areas_normals
 
 SHADE_LEVELS = 16
 # Head-high light from where the first view looks, as drawings have it.
@@ -121,16 +121,10 @@ def simplified(mesh: SolidMesh, *, budget: int) -> SolidMesh:
 
 def feature_edges(mesh: SolidMesh, *, budget: int) -> Int[np.ndarray, "e 2"]:
     """(e, 2) vertex pairs where two faces meet at an angle; none if they exceed `budget`."""
-    area_mm2, normal = triangle_areas_normals(mesh.vertices_mm, mesh.faces)
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(mesh.faces)), 3)
-    order = np.lexsort((owner, edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    pairs = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    one, other = owner[pairs], owner[pairs + 1]
-    cosine = np.einsum("ij,ij->i", normal[one], normal[other])
-    proper = (area_mm2[one] > 0) & (area_mm2[other] > 0)
-    sharp = edges[pairs[proper & (cosine < np.cos(np.deg2rad(USUAL_PAGE.feature_deg)))]]
+    drawn = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
+    drawn.update_faces(drawn.area_faces > 0.0)
+    angles_rad = np.asarray(drawn.face_adjacency_angles)
+    sharp = np.asarray(drawn.face_adjacency_edges)[angles_rad > np.deg2rad(USUAL_PAGE.feature_deg)]
     return sharp if len(sharp) <= budget else sharp[:0]
 
 

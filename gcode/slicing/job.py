@@ -27,7 +27,7 @@ from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unprintable
 from gcode.slicing.layers import LayerGrid, Slab, plan_slabs
 from gcode.slicing.objects import Labels, boxes_apart_mm
 from gcode.slicing.options import USUAL_PART, PartOptions
-from gcode.slicing.order import nearest_first, seam_index
+from gcode.slicing.order import nearest_first, seamed
 from gcode.slicing.pen import MERGE_MM, Pen
 from gcode.slicing.regions import flattened, union
 
@@ -213,17 +213,13 @@ def _emit(
         island = left.pop(int(np.argmin([_box_distance(one.box_mm, here) for one in left])))
         labels.of_box(pen, island.box_mm)
         for group in island.groups:
-            beads = [_seamed(bead, seam, layers.options) for bead in group]
+            beads = [seamed(bead, seam, layers.options) for bead in group]
             if beads and beads[0].role is Role.EXTERNAL_PERIMETER:
                 seam = beads[0].xy_mm[0]
             for bead in nearest_first(beads, pen.position_mm[:2]):
                 _lay(pen, bead, slab, (island.outline_mm, island.starts), layers)
     labels.of_none(pen)
     return seam
-
-
-def _seamed(bead: Bead, seam_mm: Float[np.ndarray, " 2"], options: PartOptions) -> Bead:
-    return bead.started_at(seam_index(bead.xy_mm[:-1], seam_mm, options)) if bead.closed else bead
 
 
 def _box_distance(box: tuple[float, float, float, float], p: Float[np.ndarray, " 2"]) -> float:

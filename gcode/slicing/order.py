@@ -11,24 +11,16 @@ from jaxtyping import Float
 
 from gcode.slicing import order_kernels as kernels
 from gcode.slicing.beads import Bead
-from gcode.slicing.options import USUAL_PART, PartOptions
+from gcode.slicing.options import PartOptions
 
 
-def seam_index(
-    loop: Float[np.ndarray, "n 2"],
-    aim_mm: Float[np.ndarray, " 2"],
-    options: PartOptions = USUAL_PART,
-) -> int:
-    """Vertex of an open-ended loop (first point not repeated) at which to begin.
-
-    Parameters
-    ----------
-    aim_mm
-        Where the seam should be near (the seam below).
-    """
+def seamed(bead: Bead, aim_mm: Float[np.ndarray, " 2"], options: PartOptions) -> Bead:
+    """A loop that begins at its seam, near the seam below; an open bead as it is."""
+    if not bead.closed:
+        return bead
     x, y = float(aim_mm[0]), float(aim_mm[1])
     corner = options.corner_rad, options.inward_mm, options.other_mm
-    return int(kernels.seam_at(loop, x, y, *corner))
+    return bead.started_at(int(kernels.seam_at(bead.xy_mm[:-1], x, y, *corner)))
 
 
 def nearest_first(beads: list[Bead], start_mm: Float[np.ndarray, " 2"]) -> list[Bead]:

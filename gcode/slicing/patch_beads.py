@@ -22,6 +22,7 @@ from gcode.slicing.options import FillOptions, PatchOptions
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
+from gcode.stretches import stretches_of
 from gcode.surfaces.lines import near_lines
 
 CORNER_CELLS = 4  # beyond a region, as far as rounding off its corners reaches
@@ -286,9 +287,8 @@ def _smooth(
 
 def _split(chain: Chain, options: PatchOptions) -> list[Chain]:
     """Drop the pieces where there is nothing to lay."""
-    keep = np.concatenate([[False], chain.section_mm2 > options.beads.least_section_mm2, [False]])
-    edges = np.flatnonzero(np.diff(keep.astype(np.int8)))
-    return [chain.part(a, b) for a, b in zip(*(edges[k::2].tolist() for k in (0, 1)), strict=True)]
+    keep = chain.section_mm2 > options.beads.least_section_mm2
+    return [chain.part(a, b) for a, b in stretches_of(keep)]
 
 
 def contour(mask: Bool[np.ndarray, "ny nx"], model: PatchModel) -> Any:

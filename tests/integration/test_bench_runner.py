@@ -46,9 +46,7 @@ def without_times(row: object) -> object:
 
 
 def test_figures_are_those_of_a_straight_computation(dataset: Path, tmp_path: Path) -> None:
-    report = run_bench(
-        dataset, format=LAYOUT, methods=["btf-raw"], out=tmp_path, seeds=[4], classes=["block"]
-    )
+    report = run_bench(dataset, format=LAYOUT, methods=["btf-raw"], out=tmp_path, seeds=[4])
     (block, _) = open_dataset(dataset, LAYOUT).classes
     data = class_input(block, open_dataset(dataset, LAYOUT).format)
     model = make_method("btf-raw").fit(data, seed=4, cache=tmp_path)
@@ -59,7 +57,7 @@ def test_figures_are_those_of_a_straight_computation(dataset: Path, tmp_path: Pa
     points = np.concatenate([score.point for score in scores])
     whole = np.array([score.whole for score in scores])
     truth = np.array([int(sample.anomalous) for sample in block.test])
-    (row,) = report.rows
+    row, _ = report.rows
     # scores are kept in single precision: ties may fall the other way
     by_point, by_object = detection(labels, points), detection(truth, whole)
     assert row.p_auroc == pytest.approx(by_point.auroc, abs=1e-4)
@@ -184,8 +182,6 @@ def test_what_cannot_be_run_is_refused(dataset: Path, tmp_path: Path) -> None:
         run(methods=["btf-raw", "xyz"])
     with pytest.raises(InputError, match="at least one job"):
         run(jobs=0)
-    with pytest.raises(InputError, match="no class 'cup' in the data set"):
-        run(classes=["cup"])
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "run.json").write_text('{"format": "another"}')
