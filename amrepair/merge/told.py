@@ -17,7 +17,7 @@ from amrepair.errors import AlignmentError, InputError
 from amrepair.frames import moved, nearest_rotation, rigid
 from amrepair.merge.match import featured, searched
 from amrepair.merge.options import MergeOptions
-from amrepair.merge.views import Fit, Placed, View, joined
+from amrepair.merge.views import Placed, View, joined
 
 POSES_FILE = "poses.json"
 TOLD_RIGID = 1e-3  # how far a rotation may be from one: files round to five digits or so
@@ -127,7 +127,7 @@ def on_turntable(
     """
     angle = np.deg2rad(degrees)
     best: tuple[float, np.ndarray] | None = None
-    for ask in (featured, _searched):
+    for ask in (featured, lambda views, *of: searched(views, {}, *of)):
         for k in range(len(views) - 1):
             for fit in ask(views, k, k + 1, size_mm, options):
                 turn = Rotation.from_matrix(fit.pose[:3, :3]).as_rotvec()
@@ -141,12 +141,6 @@ def on_turntable(
         f"no two neighbouring views turn onto each other by {degrees:g}°; check the angle and the "
         "views' order, or leave --turntable out"
     )
-
-
-def _searched(
-    views: Sequence[View], i: int, j: int, size_mm: float, options: MergeOptions
-) -> list[Fit]:
-    return searched(views, {}, i, j, size_mm, options)
 
 
 def _about(pose: Matrix, angle: float, count: int) -> Placed:

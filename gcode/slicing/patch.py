@@ -179,7 +179,7 @@ def _without(
         return found
     kept = []
     for one in found.passes:
-        chains = tuple(c for c in one.chains if not dropped[model.cell_at(c.middle_mm)])
+        chains = tuple(c for c in one.chains if not model.at(dropped, c.middle_mm[None], False)[0])
         if chains:
             kept.append(replace(one, chains=chains))
     return PatchPasses(tuple(kept), found.state.without(model, dropped))

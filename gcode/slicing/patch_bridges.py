@@ -182,13 +182,8 @@ class Holds:
         self, xy_mm: Float[np.ndarray, "n 2"], what: Bool[np.ndarray, "ny nx"]
     ) -> Bool[np.ndarray, " m"]:
         """Of columns, by the middles between points; true beyond the patch."""
-        model = self._model
-        middles = 0.5 * (xy_mm[1:] + xy_mm[:-1])
-        cells = np.floor((middles - model.origin_mm) / model.cell_mm).astype(np.int64)[:, ::-1]
         # a job's lines go on beyond the patch, where they lie
-        inside = ((cells >= 0) & (cells < model.shape)).all(axis=1)
-        rows, columns = np.where(inside[:, None], cells, 0).T
-        return np.asarray(what[rows, columns] | ~inside)
+        return self._model.at(what, 0.5 * (xy_mm[1:] + xy_mm[:-1]), True)
 
     def stretches(self, xy_mm: Float[np.ndarray, "n 2"]) -> list[tuple[int, int]]:
         """From which point to which a line lies on something, or hangs between two holds."""

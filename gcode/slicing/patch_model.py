@@ -6,14 +6,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from scipy import ndimage
 
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 from gcode.slicing.job_lines import JobColumns, JobLines
 from gcode.slicing.options import USUAL_PATCH, PatchOptions
-from gcode.slicing.reach import Reach
+from gcode.slicing.reach import Reach, cells_below
 from gcode.surfaces import HeightField
 from gcode.surfaces import raster_kernels as kernels
 
@@ -139,10 +139,12 @@ class PatchModel:
         thick_mm = np.minimum(self.top_mm[over] - from_mm[over], self.wanted_below(np.inf)[over])
         return float(np.clip(thick_mm, 0.0, None).sum()) * self.cell_mm**2 * self.weight
 
-    def cell_at(self, point_mm: Float[np.ndarray, " 2"]) -> tuple[int, int]:
-        """Row and column of the column that a point lies over."""
-        ix, iy = np.floor((point_mm - self.origin_mm) / self.cell_mm).astype(np.int64)
-        return int(iy), int(ix)
+    def at(
+        self, what: Shaped[np.ndarray, "ny nx"], points_mm: Float[np.ndarray, "n 2"], beyond: float
+    ) -> Shaped[np.ndarray, " n"]:
+        """What is said of the columns below points; the same of all points beyond the patch."""
+        cells, inside = cells_below(points_mm, self.origin_mm, self.cell_mm, self.shape)
+        return np.where(inside, what[cells[:, 0], cells[:, 1]], beyond)
 
     def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
         """Columns over which the nozzle may be, from an answer of `reach`."""
@@ -150,10 +152,7 @@ class PatchModel:
 
     def is_over(self, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
         """Whether something is missing below points."""
-        cells = np.floor((points_mm - self.origin_mm) / self.cell_mm).astype(np.int64)[:, ::-1]
-        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
-        cells = np.where(inside[:, None], cells, 0)
-        return np.asarray(inside & np.isfinite(self.top_mm[cells[:, 0], cells[:, 1]]))
+        return np.isfinite(self.at(self.top_mm, points_mm, np.inf))
 
     def raised(
         self, columns: Bool[np.ndarray, "ny nx"], to_mm: Float[np.ndarray, "ny nx"]

@@ -92,7 +92,8 @@ def _by_region(
     found: dict[int, list[tuple[Pass, Chain]]] = {}
     for one in passes:
         for chain in one.chains:
-            found.setdefault(int(label[model.cell_at(chain.middle_mm)]), []).append((one, chain))
+            region = int(model.at(label, chain.middle_mm[None], 0)[0])
+            found.setdefault(region, []).append((one, chain))
     return found
 
 

@@ -99,9 +99,8 @@ def _along_own_held(
 def _told_cold(chain: Chain, model: PatchModel, state: PatchState, at: Height) -> Chain:
     """The chain, told where it lies on what has long been there; what hangs lies on nothing."""
     middles = 0.5 * (chain.xy_mm[1:] + chain.xy_mm[:-1])
-    cells = tuple(np.array([model.cell_at(middle) for middle in middles]).T)
-    on_it = at.z_mm - state.surface_mm[cells] <= at.deep_mm
-    return replace(chain, cold=np.asarray(on_it & (state.laid_mm[cells] <= 0)))
+    on_it = at.z_mm - model.at(state.surface_mm, middles, -np.inf) <= at.deep_mm
+    return replace(chain, cold=np.asarray(on_it & (model.at(state.laid_mm, middles, 0.0) <= 0)))
 
 
 @dataclass(frozen=True, slots=True)

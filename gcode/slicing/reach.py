@@ -210,11 +210,7 @@ class Reach:
         self, points_mm: Float[np.ndarray, "n 2"]
     ) -> tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
         """Cells of points, the first one for those outside, and which lie inside."""
-        index = np.floor((points_mm - self.field.origin_mm) / self.cell_mm).astype(np.int64)[
-            :, ::-1
-        ]
-        inside = np.asarray(((index >= 0) & (index < self.shape)).all(axis=1))
-        return np.where(inside[:, None], index, 0), inside
+        return cells_below(points_mm, self.field.origin_mm, self.cell_mm, self.shape)
 
     def reason_at(self, point_mm: Float[np.ndarray, " 2"], z_mm: float) -> str | None:
         """What stands in the way of the tip at one place; None where nothing does."""
@@ -231,3 +227,15 @@ class Reach:
             return None
         by = f"{worst:.1f} mm" if worst >= LEAST_TOLD_MM else f"less than {LEAST_TOLD_MM:g} mm"
         return f"the {part.part} would touch what stands beside it by {by}"
+
+
+def cells_below(
+    points_mm: Float[np.ndarray, "n 2"],
+    origin_mm: Float[np.ndarray, " 2"],
+    cell_mm: float,
+    shape: tuple[int, int],
+) -> tuple[Int[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Rows and columns of a grid's cells below points, the first for those beyond; which are in."""
+    index = np.floor((points_mm - origin_mm) / cell_mm).astype(np.int64)[:, ::-1]
+    inside = np.asarray(((index >= 0) & (index < shape)).all(axis=1))
+    return np.where(inside[:, None], index, 0), inside
