@@ -11,11 +11,14 @@ from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from amrepair.arrays import Matrix, Points, Vector
 from amrepair.frames import nearest_rotation, rigid
 
 VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
+# Of two points so many voxels apart neither has a normal, and without any the matcher crashes.
+NORMAL_VOXELS = 3.0
 
 
 def poses_between(
@@ -41,6 +44,8 @@ def _kiss(
 ) -> Matrix | None:
     import kiss_matcher
 
+    if not (_has_normals(points_mm, voxel_mm) and _has_normals(surface_mm, voxel_mm)):
+        return None
     # Points are taken about their own centres, since the matcher computes in single precision.
     source, target = points_mm.mean(axis=0), surface_mm.mean(axis=0)
     matcher = kiss_matcher.KISSMatcher(
@@ -55,6 +60,13 @@ def _kiss(
     rotation = nearest_rotation(rotation)
     shift = np.asarray(answer.translation, dtype=np.float64).reshape(3)
     return rigid(rotation, target + shift - rotation @ source)
+
+
+def _has_normals(points_mm: Points, voxel_mm: float) -> bool:
+    """Whether a point of each voxel has others near enough for a normal, for some of them."""
+    kept = points_mm[np.unique(np.floor(points_mm / voxel_mm), axis=0, return_index=True)[1]]
+    near = cKDTree(kept).query(kept, k=4, distance_upper_bound=(NORMAL_VOXELS - 1.0) * voxel_mm)[0]
+    return bool(np.isfinite(near[:, 3]).any())
 
 
 def _by_axes(points_mm: Points, surface_mm: Float[np.ndarray, "m 3"]) -> Iterator[Matrix]:

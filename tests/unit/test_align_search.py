@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.align import AlignOptions, Registration, align
+from amrepair.align.coarse import by_features
 from amrepair.align.options import PIECE, USUAL_ALIGN, CoarseOptions
 from amrepair.align.search import CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
@@ -371,3 +372,11 @@ def test_a_view_of_a_bent_thin_plate_lies_on_its_larger_piece(
     found = align(scan, template, part_is_known=True, options=QUICK_ALONE)
     off = (found.template_from_scan.apply(moved) - noisy)[beyond == 0.0]
     assert float(np.sqrt((off**2).sum(axis=1).mean())) < 0.05
+
+
+def test_a_cloud_too_sparse_for_normals_has_no_match_by_features() -> None:
+    """Regression: the matcher crashed, and the process with it."""
+    ball = np.array(trimesh.creation.icosphere(subdivisions=3, radius=30.0).vertices)
+    dense, _ = trimesh.sample.sample_surface(trimesh.creation.box((50, 40, 30)), 20_000, seed=0)
+    assert list(by_features(ball, np.array(dense), 70.0)) == []
+    assert list(by_features(np.array(dense), ball, 70.0)) == []
