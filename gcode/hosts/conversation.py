@@ -38,6 +38,8 @@ MOST_WAIT_S = 0.5
 _READABLE = bytes((*range(0x20, 0x7F), *b"\t\r\n"))
 UNREADABLE_BYTES, UNREADABLE_SHARE = 64, 0.25
 """Bytes to judge by, and the share of them that is no text's: of random ones 0.62 is none."""
+WIRE_FAULTS = (ev.LineError, ev.ResendRequested, ev.ResendRefused, ev.UnknownCommand)
+"""What is said after bytes were damaged on their way to the printer."""
 PROOF_QUIET_S = 0.2
 """A printer that has said nothing for so long has nothing left to say."""
 
@@ -100,6 +102,7 @@ class SerialConversation:
         self._heads: set[int] = set()  # that reports told of, where there are several
         self._asked = {"M114": 0, "M115": 0}
         self._heard = {"M114": 0, "M115": 0}
+        self._went_wrong = False  # on the wire, since the last proof
         self._failure: Exception | None = None
         self._ended_by = ""  # why another thread has ended the link
         self._warnings: deque[str] = deque(maxlen=100)
@@ -315,12 +318,15 @@ class SerialConversation:
 
         A question is carried out once and answered once: when all questions of a kind are
         answered, the last of them has been received, and with it every line before. Where one is
-        missing, an answer was garbled, or the `ok`s are ahead of the printer: it is heard out, and
-        from then on only new questions count. A firmware that verifies numbers tells its line.
+        missing, an answer was garbled, or the `ok`s are ahead of the printer; where there are more
+        answers than questions, half a question was carried out without its number. Then it is heard
+        out, and from then on only new questions count. A firmware that verifies numbers tells its
+        line, and is asked for it, too, after anything that went wrong on the wire.
         """
         for kind in (*("M114",) * 4, "M115", "M114", "M115"):
             self._ask(kind)
-            if self._heard[kind] >= self._asked[kind]:
+            sound = not (self._went_wrong and self._link.dialect.verifies)
+            if sound and self._heard[kind] == self._asked[kind]:
                 self._link.confirm()
                 return
             self._settle(PROOF_QUIET_S)
@@ -340,6 +346,7 @@ class SerialConversation:
                     heard += self._pump()
             if any(isinstance(event, ev.Proved) for event in heard):
                 self._asked, self._heard = {"M114": 0, "M115": 0}, {"M114": 0, "M115": 0}
+                self._went_wrong = False
                 return
         self._lost("the printer does not prove that it received the last lines")
 
@@ -435,6 +442,7 @@ class SerialConversation:
     def _on_event(self, event: ev.Event) -> None:
         if isinstance(event, ev.Acknowledged):
             return
+        self._went_wrong |= isinstance(event, WIRE_FAULTS)
         if isinstance(event, ev.TemperatureReport):
             self._temperatures = event
             if len(event.heads) > 1:

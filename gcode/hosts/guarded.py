@@ -68,6 +68,7 @@ class GuardedConversation(SerialConversation):
             self._greet(self._journal.open_session() if self._journal and counted else 0)
             if self._line.guard and self._link.dialect.verifies:
                 self._test_guard()
+                self._went_wrong = False  # what was sent damaged was to be
             self._learn()
             self._prove()  # from here on a silent reset cannot be taken for a resend request
         except BaseException:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import pty
+import re
 import sys
 import threading
+import tty
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -247,6 +251,64 @@ def test_the_place_is_proved_by_a_number_said_twice() -> None:
     for attempt in range(2):
         link.receive(b"Resend: 1\nok\n", 1.0 + attempt)  # proved: never sent again
     assert b"N1 " not in link.take_output()
+
+
+def test_more_answers_than_questions_prove_nothing() -> None:
+    """Regression, native Marlin behind a bad wire: a line break in a question left half of it.
+
+    The half was carried out without a number and answered, and so was the question itself, sent
+    again. That spare answer proved the last line of the job later on, which had never arrived.
+    """
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    taken: list[bytes] = []
+    place = b"X:1.00 Y:1.00 Z:5.00 E:0.00 Count X:0 Y:0 Z:0\nok\n"
+
+    def answer() -> None:
+        last, split, lost = 0, False, False
+        with contextlib.suppress(OSError), os.fdopen(ours, "rb", buffering=0) as port:
+            for line in port:
+                said = re.match(rb"N(\d+) ?([^*]+)", line)
+                if said is None:
+                    continue
+                number, command = int(said[1]), said[2].strip()
+                whole = line.strip().endswith(b"*%d" % checksum(said[0]))
+                asked, say = command == b"M114", b"ok\n"
+                if command.startswith(b"M110"):
+                    last = number
+                elif number != last + 1 or not whole or (asked and not split):
+                    why = (
+                        b"Line Number is not Last Line Number+1" if whole else b"checksum mismatch"
+                    )
+                    say = b"Error:%s, Last Line: %d\nResend: %d\nok\n" % (why, last, last + 1)
+                    if (
+                        number == last + 1 and whole
+                    ):  # of the first question a half was one without a number
+                        split, say = True, say + place
+                elif asked and b"G1 X2" in taken and not lost:
+                    lost = True  # the answer to something else is taken for this line's
+                else:
+                    last = number
+                    taken.append(command)
+                    if command.startswith(b"M115"):
+                        say = b"FIRMWARE_NAME:Marlin 2.0.9 PROTOCOL_VERSION:1.0\nok\n"
+                    elif asked:
+                        say = place
+                    elif command.startswith(b"M105"):
+                        say = b"ok T:20.0 /0.0 B:20.0 /0.0\n"
+                os.write(ours, say)
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    printer = SerialPrinter(os.ttyname(theirs), supervise=False)
+    printer.connect()
+    os.close(theirs)
+    assert printer.print(program(["G1 X1", "G1 X2"])).ok
+    after = taken[taken.index(b"G1 X2") :]
+    assert b"M114" in after, after
+    assert [line for line in taken if line.startswith(b"G1")] == [b"G1 X1", b"G1 X2"]
+    printer.close()
+    thread.join(10)
 
 
 def test_bug_09_comments_stay_here_and_rs_is_heard() -> None:
