@@ -318,19 +318,22 @@ class SerialConversation:
 
         A question is carried out once and answered once: when all questions of a kind are
         answered, the last of them has been received, and with it every line before. Where one is
-        missing, an answer was garbled, or the `ok`s are ahead of the printer; where there are more
-        answers than questions, half a question was carried out without its number. Then it is heard
-        out, and from then on only new questions count. A firmware that verifies numbers tells its
-        line, and is asked for it, too, after anything that went wrong on the wire.
+        missing, an answer was garbled, or the `ok`s are ahead of the printer: it is heard out, and
+        from then on only new questions count. A firmware that verifies numbers tells its line
+        instead, and also after anything that went wrong on the wire, or where there are more
+        answers than questions: half of one was carried out without its number then. (Without
+        numbers the link asks questions of its own where an `ok` is missing: more are no wonder.)
         """
+        verifies = self._link.dialect.verifies
         for kind in (*("M114",) * 4, "M115", "M114", "M115"):
             self._ask(kind)
-            sound = not (self._went_wrong and self._link.dialect.verifies)
-            if sound and self._heard[kind] == self._asked[kind]:
+            spare = self._heard[kind] - self._asked[kind]
+            doubtful = verifies and (self._went_wrong or spare > 0)
+            if spare >= 0 and not doubtful:
                 self._link.confirm()
                 return
             self._settle(PROOF_QUIET_S)
-            if self._link.dialect.verifies:
+            if verifies:
                 self._prove_place()
                 return
             self._asked[kind] = self._heard[kind] = 0

@@ -23,7 +23,7 @@ import gcode.hosts.serial as serial_host
 from gcode.errors import LocalProtocolError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.serial import SerialPrinter
-from gcode.protocol import HISTORY_LINES, Link, State, checksum
+from gcode.protocol import HISTORY_LINES, Link, LinkTiming, State, checksum
 from gcode.protocol import events as ev
 
 LINES = [f"G1 X{i} Y{i * 3 % 170} F6000" for i in range(60)]
@@ -309,6 +309,19 @@ def test_more_answers_than_questions_prove_nothing() -> None:
     assert [line for line in taken if line.startswith(b"G1")] == [b"G1 X1", b"G1 X2"]
     printer.close()
     thread.join(10)
+
+
+def test_where_no_number_is_verified_the_links_own_questions_are_no_doubt() -> None:
+    """Regression: where an `ok` is lost the link asks itself, and had more answers than questions.
+
+    It had taken them for a doubt and asked again, until it gave the printer up.
+    """
+    quick = LinkTiming(silence_s=0.2, doubt_s=0.05, resend_grace_s=0.05)
+    faults = "every 3 lose_ok"
+    with EmulatedPrinterProcess(printer=profile(), firmware="klipper", faults=faults) as emulator:
+        printer = SerialPrinter(emulator.port, dialect="klipper", supervise=False, timing=quick)
+        printer.connect()
+        printer.close()
 
 
 def test_bug_09_comments_stay_here_and_rs_is_heard() -> None:
