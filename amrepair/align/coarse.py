@@ -14,11 +14,13 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Matrix, Points, Vector
-from amrepair.frames import nearest_rotation, rigid
+from amrepair.frames import cells_of, nearest_rotation, rigid
 
 VOXEL_RATIOS = (0.012, 0.02)  # of the part's diagonal
-# Of two points so many voxels apart neither has a normal, and without any the matcher crashes.
-NORMAL_VOXELS = 3.0
+# The matcher takes normals from points within three voxels, and crashes where no point has any.
+# One voxel less: the point of a voxel lies anywhere in it.
+NORMAL_VOXELS = 2.0
+POINTS_AT_ONCE = 1000
 
 
 def poses_between(
@@ -64,9 +66,14 @@ def _kiss(
 
 def _has_normals(points_mm: Points, voxel_mm: float) -> bool:
     """Whether a point of each voxel has others near enough for a normal, for some of them."""
-    kept = points_mm[np.unique(np.floor(points_mm / voxel_mm), axis=0, return_index=True)[1]]
-    near = cKDTree(kept).query(kept, k=4, distance_upper_bound=(NORMAL_VOXELS - 1.0) * voxel_mm)[0]
-    return bool(np.isfinite(near[:, 3]).any())
+    cell = cells_of(points_mm, points_mm.min(axis=0) // voxel_mm * voxel_mm, voxel_mm)
+    number = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
+    kept = points_mm[np.unique(number, return_index=True)[1]]
+    tree, reach_mm = cKDTree(kept), NORMAL_VOXELS * voxel_mm
+    return any(  # of all but the sparsest clouds the first few say so
+        np.isfinite(tree.query(some, k=4, distance_upper_bound=reach_mm)[0][:, 3]).any()
+        for some in np.split(kept, range(POINTS_AT_ONCE, len(kept), POINTS_AT_ONCE))
+    )
 
 
 def _by_axes(points_mm: Points, surface_mm: Float[np.ndarray, "m 3"]) -> Iterator[Matrix]:

@@ -132,17 +132,17 @@ def _far_off(
     far off there may reach into them, so that one place at least is taken to.
     """
     found: list[FarOffTold] = []
-    narrowest = (0.0, 0.0)
+    narrowest: tuple[float, float] | None = None
     for scales, wider in zip(alike, octave, strict=True):
         far_mm = np.concatenate([scale.far_mm[side] for scale in scales])
-        usual_mm = usual * float(np.median([scale.error_mm for scale in scales]))
-        told_by = float(LEAST_PEAKS + len(far_mm))
-        square = (float((far_mm**2).sum()) + LEAST_PEAKS * usual_mm**2) / told_by
-        told = (float(np.sqrt(square)), told_by) if len(far_mm) else (0.0, 0.0)
-        if wider <= HALF_OCTAVE and told[1]:
-            narrowest = told
-        if wider <= 1.0 + HALF_OCTAVE and not told[1]:
-            told = narrowest
+        told = narrowest if wider <= 1.0 + HALF_OCTAVE else None
+        if len(far_mm):
+            usual_mm = usual * float(np.median([scale.error_mm for scale in scales]))
+            told_by = float(LEAST_PEAKS + len(far_mm))
+            square = (float((far_mm**2).sum()) + LEAST_PEAKS * usual_mm**2) / told_by
+            told = float(np.sqrt(square)), told_by
+            if wider <= HALF_OCTAVE:
+                narrowest = told
         rate = max(len(far_mm), 1) / sum(scale.windows for scale in scales)
-        found.append((told[0], rate, told[1]) if told[1] else NONE_FAR_OFF)
+        found.append(NONE_FAR_OFF if told is None else (told[0], rate, told[1]))
     return found

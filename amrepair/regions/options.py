@@ -144,7 +144,8 @@ class RegionOptions:
         Standard errors beyond the tolerance from which on exceedances tell the tail.
     longest_tail
         Standard errors over which exceedances of sound places fall to 1/e, at most: on twelve real
-        range scans 0.2 to 1.5.
+        range scans 0.2 to 1.5. A calibration takes what lies far off to spread so far before it
+        has seen any.
     grow_share
         A region goes on to where the mean deviation is this share of the tolerance.
     grow_sigmas

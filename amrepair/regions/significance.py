@@ -291,11 +291,9 @@ def _errors(
     aslant = 1.0 if calibration is None else np.maximum(calibration.facing / facing, 1.0)
     explained = options.process_sigma_mm**2 + window**2
     common = np.sqrt(np.maximum((wander[group] * aslant) ** 2 - explained, 0.0) + pose_mm**2)
-    least = np.partition(facing, min(options.least_cells, len(facing)) - 1)
-    return Errors(
-        cell, window, common, wander, freedom, group,
-        facing=float(least[min(options.least_cells, len(facing)) - 1]),
-    )  # fmt: skip
+    few = min(options.least_cells, len(facing)) - 1
+    least = float(np.partition(facing, few)[few])
+    return Errors(cell, window, common, wander, freedom, group, least)
 
 
 def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:
