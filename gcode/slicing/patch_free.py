@@ -112,7 +112,7 @@ def free_runs(
     return [
         Bead(
             points[a : b + 1],
-            np.ones(b - a),
+            bead.share_mm[owner[a:b]],
             bead.role,
             closed=bool(bead.closed and b - a == len(owner)),
         )
