@@ -180,12 +180,15 @@ def _from_anywhere(
             whole = ratio * (1.0 - found.left_out_ratio)
             _refuse_mirrored(scan, template, found, scan.points_mm, whole, options, rng)
     sizes = other_size(scan, template, options.told_size_jump)
-    if found.left_out_ratio > options.much_left_out and not part_is_known:
-        least = options.least_of_rest
+    in_surroundings = found.left_out_ratio > options.much_left_out and not part_is_known
+    if in_surroundings:
         sizes = f" ({found.left_out_ratio:.0%} of the scan are taken for its surroundings){sizes}"
+        least = options.least_of_rest if found.is_piece else least
     if not part_is_known and ratio >= options.least_of_known:
         sizes += "; if it is this part for certain, only bent, say --part-is-known"
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
+    if in_surroundings:
+        _refuse_standing_out(scan, found, 1.0 - options.least_of_rest, sizes)
     return _registration(scan, found, options)
 
 
@@ -260,6 +263,16 @@ def _refuse_misfit(
         f"within {inlier_mm:.2g} mm (at least {least:.0%} are needed)"
         + ("" if found.converged else " and the refinement did not converge")
         + f"; check part, unit and calibration{sizes}"
+    )
+
+
+def _refuse_standing_out(scan: Scan, found: Found, most: float, sizes: str) -> None:
+    if found.outside_ratio <= most:
+        return
+    raise AlignmentError(
+        f"the scan {scan.source} does not fit its template: {found.outside_ratio:.0%} of its "
+        f"points stand out of it by more than {found.inlier_mm:.2g} mm (at most {most:.0%} may); "
+        f"check part, unit and calibration{sizes}"
     )
 
 

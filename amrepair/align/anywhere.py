@@ -53,6 +53,11 @@ class Found:
         (n, 3) what may be the part: the scan, or a sample of it without clutter.
     left_out_ratio
         Share of the points that was taken for clutter.
+    outside_ratio
+        Share of the points that stand out of the part, clutter left aside. What is missing does
+        not: its floor lies inside.
+    is_piece
+        Whether the part is taken to be one of several pieces of the scan, that which fits best.
     sigma_mm, inlier_mm
         How well points were taken to agree with the template, and how near explained ones lie.
     field
@@ -66,6 +71,8 @@ class Found:
     left_out_ratio: float
     sigma_mm: float
     inlier_mm: float
+    outside_ratio: float = 0.0
+    is_piece: bool = False
     field: CoarseField | None = None
 
 
@@ -90,6 +97,7 @@ class _Hunt:
     inlier_mm: float
     found: list[Scored] = dataclasses.field(default_factory=list)
     left_out_ratio: float = 0.0
+    is_piece: bool = False
     twinned: list[Matrix] = dataclasses.field(default_factory=list)
 
     @property
@@ -214,6 +222,7 @@ def _ask_the_whole(
     clearer = float((np.abs(off_mm) <= hunt.inlier_mm).mean()) + told.clearer_by
     if share > told.cleared or share > max(least_ratio, clearer):
         hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = clouds, whole, 0.0, points_mm
+        hunt.is_piece = False
 
 
 def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
@@ -225,7 +234,7 @@ def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
     ratio = float((np.abs(residual) <= hunt.inlier_mm).mean())
     return Found(
         best, others, ratio, hunt.part_mm, hunt.left_out_ratio, hunt.sigma_mm, hunt.inlier_mm,
-        hunt.field,
+        float((residual > hunt.inlier_mm).mean()), hunt.is_piece, hunt.field,
     )  # fmt: skip
 
 
@@ -239,7 +248,7 @@ def _leave_clutter(hunt: _Hunt, points_mm: Points, rng: np.random.Generator) -> 
         again = refined(starts, fewer, hunt.template)
         if explained(again[0][1], hunt.inlier_mm) > hunt.share:
             hunt.clouds, hunt.found, hunt.part_mm = fewer, again, kept.points_mm
-            hunt.left_out_ratio = kept.left_out_ratio
+            hunt.left_out_ratio, hunt.is_piece = kept.left_out_ratio, kept.is_piece
         if hunt.share > options.explained.cleared:
             break
 

@@ -29,10 +29,13 @@ class Kept:
         (n, 3) of a sample of the scan, in its frame.
     left_out_ratio
         Share of the sample that is not among them.
+    is_piece
+        One of several that do not touch: whoever tries them all takes the one that fits best.
     """
 
     points_mm: Points
     left_out_ratio: float
+    is_piece: bool = False
 
 
 def without_clutter(
@@ -61,13 +64,14 @@ def without_clutter(
     if bed is not None and (surface & ~bed).sum() >= options.least_left:
         # What is left of the bed's rim and noise is scattered by now.
         masks.append(surface & ~bed)
+    whole = len(masks)
     masks += _pieces(cloud, masks[-1], options.gap_factor * usual_mm, options)
     found: list[Kept] = []
     last = len(cloud)
-    for mask in masks:
+    for k, mask in enumerate(masks):
         count = int(mask.sum())
         if count >= options.least_left and abs(last - count) > options.worth * len(cloud):
-            found.append(Kept(cloud[mask], 1.0 - count / len(cloud)))
+            found.append(Kept(cloud[mask], 1.0 - count / len(cloud), is_piece=k >= whole))
             last = count
     return found
 
