@@ -38,7 +38,10 @@ def refuse_other_size(scan: Scan, template: Template, options: AlignOptions) -> 
     ratio, slack = size / max(other, 1e-12), options.unit_slack
     if options.smallest_ratio <= ratio <= options.largest_ratio:
         return
-    units = [unit for unit in SCAN_UNITS if 1 / slack < ratio * MM_PER[unit] < slack]
+    as_large = {unit: ratio * MM_PER[unit] for unit in SCAN_UNITS}
+    units = [unit for unit in SCAN_UNITS if 1 / slack < as_large[unit] < slack]
+    if not units and ratio < 1.0:  # with what surrounds the part a scan is larger
+        units = [unit for unit in SCAN_UNITS if slack <= as_large[unit] <= options.largest_ratio]
     near = [SCAN_UNITS[unit] for unit in units]
     near += [  # no drawing is in micrometres
         f"a template in {name}"

@@ -223,7 +223,8 @@ def test_a_part_of_metres_is_aligned(noise_mm: float) -> None:
         (10.0, r"\(centimetres for"),
         (1 / 25.4, r"\(a template in inches for"),  # regression: "mils for millimetres?"
         (1e-3, r"\(micrometres or a template in metres for"),
-        (100.0, "or it shows too little"),
+        (300.0, r"\(metres for.*--scan-unit m$"),  # with what surrounds it, three times as large
+        (48.0, "or it shows too little"),
         (0.005, "same unit$"),
     ],
 )
