@@ -185,7 +185,10 @@ def _from_anywhere(
         sizes = f" ({found.left_out_ratio:.0%} of the scan are taken for its surroundings){sizes}"
         least = options.least_of_rest if found.is_piece else least
     if not part_is_known and ratio >= options.least_of_known:
-        sizes += "; if it is this part for certain, only bent, say --part-is-known"
+        sizes += (
+            "; if it is this part for certain, only bent, say so (align, detect and repair take "
+            "--part-is-known)"
+        )
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
     if in_surroundings:
         _refuse_standing_out(scan, found, 1.0 - options.least_of_rest, sizes)

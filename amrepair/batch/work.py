@@ -147,6 +147,7 @@ class Bench:
         site = replace(
             Site.of_part(held.template, setup, build_from_template=placed),
             on_fixture=options.on_fixture,
+            part_is_known=options.part_is_known,
             calibration=self._work.calibration,
         )
         plan = plan_repair(

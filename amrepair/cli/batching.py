@@ -183,6 +183,7 @@ def repair(
     process: ProcessOption = DEFAULT_PROCESS,
     part_pose: PoseOption = None,
     on_fixture: FixtureOption = False,
+    part_is_known: KnownOption = False,
     calibration: CalibrationOption = None,
     **common: Any,
 ) -> Judging:
@@ -194,8 +195,8 @@ def repair(
         x, y, z, turn_deg = (float(value) for value in numbers(part_pose, 4, "--part-pose"))
         placed = (x, y, z, turn_deg)
     options = BatchOptions(
-        BatchKind.REPAIR, part_pose=placed, on_fixture=on_fixture, printer=printer,
-        material=material, process=process, **common,
+        BatchKind.REPAIR, part_pose=placed, on_fixture=on_fixture, part_is_known=part_is_known,
+        printer=printer, material=material, process=process, **common,
     )  # fmt: skip
     return options, calibration
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amrepair.cli.files import read_early
-from amrepair.cli.inspect import TemplateOption
+from amrepair.cli.inspect import KnownOption, TemplateOption
 from amrepair.cli.options import (
     CalibrationOption,
     SeedOption,
@@ -100,6 +100,7 @@ def repair(
             "--on-fixture", help="The part stands on something: its foot is above the bed."
         ),
     ] = False,
+    part_is_known: KnownOption = False,
     sensor_at: SensorOption = None,
     scan_unit: UnitOption = None,
     calibration: CalibrationOption = None,
@@ -177,6 +178,7 @@ def repair(
             grid,
             placed if frame == "scanner" else None,
             on_fixture=on_fixture,
+            part_is_known=part_is_known,
             damage_at_mm=damage_at_mm,
             calibration=known_errors,
         )

@@ -197,6 +197,7 @@ def _align(
                 scan if guess is None else in_view.without_finished(scan, site, guess),
                 site.template,
                 guess=guess,
+                part_is_known=site.part_is_known,
                 so_far=in_view.so_far(site),
                 aside=in_view.laid_aside(site),
                 options=in_view.aligning(site),

@@ -101,6 +101,8 @@ class Site:
         What the bed beside the part showed of the scanner's errors in earlier looks.
     on_fixture
         Somebody said that a finished part's foot is above the bed.
+    part_is_known
+        Somebody said that the scan shows this part: less of it has to fit, as of `align`.
     damage_at_mm
         (2,) where on the bed somebody said that the largest damage is; it tells the poses of a
         symmetric part apart.
@@ -150,6 +152,7 @@ class Site:
     beds: tuple[Sound, ...] = ()
     planned: Template | None = None
     on_fixture: bool = False
+    part_is_known: bool = False
     damage_at_mm: tuple[float, float] | None = None
     beads: PlannedBeads | None = None
     lines: JobLines | None = None

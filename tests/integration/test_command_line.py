@@ -245,6 +245,13 @@ def test_a_bent_part_is_taken_when_it_is_known(chipped: dict[str, Path], tmp_pat
     taken = call(*words, "--part-is-known")
     assert taken.returncode == 0, taken.stderr
     assert len(json.loads(taken.stdout)["regions"]) > 2
+    # regression: `repair` named the option and did not have it
+    words = ["repair", *words[1:4], "-o", tmp_path / "repair.gcode"]
+    refused = call(*words)
+    assert refused.returncode == 2
+    assert "--part-is-known" in refused.stderr
+    taken = call(*words, "--part-is-known")
+    assert taken.returncode in (0, 3), taken.stderr
     many = call("align", tmp_path / "bent.xyz", "--template", tmp_path, "--part-is-known")
     assert many.returncode == 2
     assert "needs one template" in many.stderr
