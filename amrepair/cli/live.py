@@ -41,7 +41,8 @@ ViewOption = Annotated[
 TokenOption = Annotated[
     str | None,
     typer.Option(
-        envvar=TOKEN_VARIABLE, help="Secret that the page's address must carry; see --host."
+        envvar=TOKEN_VARIABLE,
+        help="Secret that the page's address must carry where other machines may open it.",
     ),
 ]
 
