@@ -146,6 +146,9 @@ class RegionOptions:
         Standard errors over which exceedances of sound places fall to 1/e, at most: on twelve real
         range scans 0.2 to 1.5. A calibration takes what lies far off to spread so far before it
         has seen any.
+    one_sided
+        So many times as many outlying cells a scanner's errors leave on one side of the template
+        as on the other, at most: in eleven real scans up to twice.
     grow_share
         A region goes on to where the mean deviation is this share of the tolerance.
     grow_sigmas
@@ -183,6 +186,7 @@ class RegionOptions:
     most_wander: float = 3.0
     tail_from: float = 1.0
     longest_tail: float = 2.0
+    one_sided: float = 2.0
     grow_share: float = 0.5
     grow_sigmas: float = 2.0
     seen_step: float = 0.5

@@ -398,14 +398,14 @@ def _level(
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
     quantile = -float(ndtri(min((share / (n * ways)) ** (1.0 / together), 0.5)))
+    critical = np.full(2, quantile)
     if statistic == 0 and calibration is None:
-        outlying = np.abs(scale.value_mm - scale.median_mm)
-        outliers = outlying > np.maximum(OUTLIER_SIGMAS * error_mm, tolerance_mm[0])
-        if n * comb(usual, RANK) * _usual_share(scale, outliers) ** RANK > share:
-            quantile = np.inf  # so many outlying cells fall together by chance
+        outlying = _outlying(scale, error_mm, tolerance_mm, options.one_sided)
+        # so many outlying cells fall together by chance
+        critical[n * comb(usual, RANK) * outlying**RANK > share] = np.inf
     safe = np.clip(z, 0.0, MOST_ERRORS)
     log_p = np.log(n * ways) + together * log_ndtr(-safe)
-    critical, far_off_mm = np.full(2, quantile), np.zeros(2)
+    far_off_mm = np.zeros(2)
     low, high = (_peaks(scale, side > options.tail_from, side) for side in z)
     for side, peaks in enumerate((low, high)):
         if calibration is not None:
@@ -415,21 +415,31 @@ def _level(
             far_off_mm[side] = far_off.exceeded_by(share)
         elif (tail := _tail(peaks, options)).scale > 0:
             log_p[side] = np.maximum(log_p[side], tail.log_expected(safe[side]))
-            critical[side] = max(quantile, tail.exceeded_by(share))
+            critical[side] = max(critical[side], tail.exceeded_by(share))
     return Level(
         scale, errors, tolerance_mm, error_mm, freedom, beyond_mm, z, critical, far_off_mm,
         quantile, log_p, (low, high),
     )  # fmt: skip
 
 
-def _usual_share(scale: Scale, outliers: Mask) -> float:
-    """What share of the cells are outliers, but for those that hang together in the largest place.
+def _outlying(
+    scale: Scale, error_mm: Values, tolerance_mm: Float[np.ndarray, "2 s"], one_sided: float
+) -> Float[np.ndarray, " 2"]:
+    """(2,) what share of the cells are outliers by a scanner's errors, for missing and for excess.
 
-    Errors are all over a scan, a defect is at one place: counted among them, its own cells would
-    be told as errors.
+    Errors are all over a scan, a defect is at one place: counted among them, its own cells would be
+    told as errors; those that hang together in the largest place are not. A defect lies to one
+    side, errors to both: on a side there are at most `one_sided` times as many of them as the other
+    tells. (Of a count of k, k + 1 is the mean that a uniform prior leaves.)
     """
+    off_mm = scale.value_mm - scale.median_mm
+    low, high = (
+        side > np.maximum(OUTLIER_SIGMAS * error_mm, tolerance_mm[0]) for side in (-off_mm, off_mm)
+    )
+    outliers = low | high
     largest = int(np.bincount(_groups(scale, outliers)[outliers], minlength=1).max())
-    return float((outliers.sum() - largest) / len(outliers))
+    most = (1.0 + one_sided) * (np.array([high.sum(), low.sum()]) + 1.0)
+    return np.minimum(outliers.sum() - largest, most) / len(outliers)
 
 
 def _groups(scale: Scale, chosen: Mask) -> Numbers:
