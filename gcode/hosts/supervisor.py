@@ -23,7 +23,7 @@ LIFT = (
     b"G1 Z5 F600",
     b"G90",
 )
-QUESTIONS = 3
+QUESTIONS = 6
 _TARGET = re.compile(rb"\b(T\d{0,2}|B): ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 _KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
 _NOT_MOVED = re.compile(rb"^(?:!!|Error:)", re.MULTILINE)
@@ -86,22 +86,27 @@ def make_safe(port_fd: int, *, lift: bool = True, heads_off: Sequence[str] = ())
 def confirmed_off(port_fd: int) -> bool:
     """Whether the printer itself reports that its heaters aim at 0.
 
-    An `ok` proves nothing: it may answer a line of the dead sender's. A Klipper that starts anew
-    is asked until it is there.
+    An `ok` proves nothing: it may answer a line of the dead sender's. Nor does one report, which
+    has no checksum: two in a row must say the same. A Klipper that starts anew is asked until it
+    is there.
     """
     asked, starts, until_s = 0, False, time.monotonic() + STARTS_S
-    while asked < QUESTIONS or (starts and time.monotonic() < until_s):
-        asked += 1
+    before: dict[bytes, bytes] = {}
+    while asked < QUESTIONS and not (starts and time.monotonic() > until_s):
         if not write(port_fd, b"M105\n"):
             return False
         heard = wait(port_fd, PORT_ANSWERS_S)[1]
         targets = dict(_TARGET.findall(heard))
-        if any(name.startswith(b"T") for name in targets):
+        if targets == before and any(name.startswith(b"T") for name in targets):
             on = [name for name, value in targets.items() if float(value) != 0.0]
             if not on or not send_off(port_fd, on):
                 return not on
-        if starts := _KLIPPER_STARTS.search(heard) is not None:
+        before = targets
+        starts = _KLIPPER_STARTS.search(heard) is not None
+        if starts:
             time.sleep(PORT_ANSWERS_S)
+        else:
+            asked += 1
     return False
 
 
