@@ -161,8 +161,7 @@ class SerialPrinter(GuardedConversation):
         try:
             super().finish_moves()
         except LinkError:
-            if self._link.forgot:  # received it had them all, and the journal says so
-                self._book.lost()
+            self._book.lost()  # all are received, and perhaps not made
             raise
 
     def _note_temperatures(self, now_s: float) -> None:
