@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 
 HEATERS_OFF = (b"M104 S0", b"M140 S0")
+_OFF = dict(zip((b"T", b"B"), HEATERS_OFF, strict=True))
 END_WAIT = b"M108"
 """Ends a wait for temperature, where the firmware lets it pass the queue."""
 LIFT = (
@@ -99,8 +100,9 @@ def confirmed_off(port_fd: int) -> bool:
         targets = dict(_TARGET.findall(heard))
         if targets == before and any(name.startswith(b"T") for name in targets):
             on = [name for name, value in targets.items() if float(value) != 0.0]
-            if not on or not send_off(port_fd, on):
-                return not on
+            if not on:
+                return True
+            send_off(port_fd, on)
         before = targets
         starts = _KLIPPER_STARTS.search(heard) is not None
         if starts:
@@ -110,13 +112,11 @@ def confirmed_off(port_fd: int) -> bool:
     return False
 
 
-def send_off(port_fd: int, on: list[bytes]) -> bool:
-    """Switch off heads that nobody had told of; whether there is one among what is on."""
-    heads = [name for name in on if name[1:]]
-    for name in heads:
-        write(port_fd, b"M104 %s S0\n" % name)
+def send_off(port_fd: int, on: list[bytes]) -> None:
+    """Switch off what is on all the same: heads that nobody had told of, or a line was damaged."""
+    for name in on:
+        write(port_fd, _OFF.get(name, b"M104 %s S0" % name) + b"\n")
         wait(port_fd, PORT_ANSWERS_S)
-    return bool(heads)
 
 
 def write(port_fd: int, data: bytes) -> bool:

@@ -12,6 +12,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,9 @@ class Scene:
         after = int(2.2 * (len(self.beads) + 60) * self.rng.random())
         if self.act:
             self.port.at[self.port.calls + 1 + after] = acts[self.act]
+            if self.rng.random() < 0.3:  # and once more, soon
+                later = after + self.rng.randrange(1, 40)
+                self.port.at[self.port.calls + 1 + later] = acts[self.rng.choice(ACTS)]
         # A short write is taken whole or not at all, but where a board's own buffer is full.
         halves = self.act == "kill" and self.dialect in VERIFYING
         self.port.written = self.rng.choice((0.0, 0.5, 1.0) if halves else (0.0, 1.0))
@@ -169,11 +173,21 @@ class Scene:
         self.someone_acts(printer)
         if self.attempt:
             report = resume(printer, self.job, release_c=40.0, wall_clock=self.port.clock)
+            printer.finish_moves()
         else:
             printer.connect()
-            report = printer.print(self.job)
-        printer.finish_moves()
+            for lines in self.parts():
+                report = printer.print(self.job, lines=lines)
+                printer.finish_moves()
+                if not report.ok:
+                    break
         return report.ok
+
+    def parts(self) -> list[range]:
+        """The job's lines, in one or in several goes."""
+        total = self.job.program.text.count("\n") + 1
+        cuts = sorted(self.rng.sample(range(1, total), self.rng.choice((0, 0, 1, 3))))
+        return [range(a, b) for a, b in pairwise((0, *cuts, total))]
 
     def play(self) -> None:
         """Send the job again and again, until it is printed or refused for good."""

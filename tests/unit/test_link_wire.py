@@ -189,6 +189,14 @@ def test_a_report_that_lost_a_digit_makes_no_heater_cold() -> None:
         assert "heaters off" not in said
 
 
+def test_a_heater_that_a_damaged_line_left_on_is_told_again() -> None:
+    """Seed 51305: `M140 S0` had become `M140 S4`, and the printer reported it."""
+    on, off = b"ok T:205.0 /0.0 B:60.0 /4.0\n", b"ok T:205.0 /0.0 B:60.0 /0.0\n"
+    said, heard = answering(iter([on, on, off, off]))
+    assert said == "heaters off (the printer reports targets of 0), nozzle lifted"
+    assert heard[-3:] == [b"M140 S0", b"M105", b"M105"]
+
+
 def test_temperatures_are_what_two_reports_agree_on(bench: Bench) -> None:
     printer = bench.sender()
     printer.connect()
