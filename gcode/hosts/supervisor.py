@@ -25,7 +25,7 @@ LIFT = (
     b"G90",
 )
 QUESTIONS = 6
-_TARGET = re.compile(rb"\b(T\d{0,2}|B): ?-?[\d.]+ ?/ ?(-?[\d.]+)")
+_TARGET = re.compile(rb"\b([A-Z]\d{0,2}): ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 _KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
 _NOT_MOVED = re.compile(rb"^(?:!!|Error:)", re.MULTILINE)
 _KLIPPER_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
@@ -97,8 +97,8 @@ def confirmed_off(port_fd: int) -> bool:
         if not write(port_fd, b"M105\n"):
             return False
         heard = wait(port_fd, PORT_ANSWERS_S)[1]
-        targets = dict(_TARGET.findall(heard))
-        if targets == before and any(name.startswith(b"T") for name in targets):
+        targets = targets_of(heard)
+        if targets and targets == before:
             on = [name for name, value in targets.items() if float(value) != 0.0]
             if not on:
                 return True
@@ -110,6 +110,16 @@ def confirmed_off(port_fd: int) -> bool:
         else:
             asked += 1
     return False
+
+
+def targets_of(heard: bytes) -> dict[bytes, bytes]:
+    """What the last report says that nozzles and bed aim at; nothing where it is damaged."""
+    for line in reversed(heard.split(b"\n")):
+        targets = _TARGET.findall(line)
+        heaters = {name: value for name, value in targets if name[:1] in b"TB"}
+        if any(name[:1] == b"T" for name in heaters):
+            return heaters if line.count(b"/") == len(targets) else {}
+    return {}
 
 
 def send_off(port_fd: int, on: list[bytes]) -> None:

@@ -27,6 +27,7 @@ from gcode.protocol.belief import ResendVerdict
 from gcode.protocol.events import (
     Busy,
     CommandFailed,
+    Echo,
     Event,
     Greeted,
     LineError,
@@ -44,7 +45,7 @@ from gcode.protocol.events import (
 )
 from gcode.protocol.lines import WireLine, WireLines, wire_line
 from gcode.protocol.recovery import NEVER_S, Recovery
-from gcode.protocol.replies import parse_reply
+from gcode.protocol.replies import parse_reply, repeats
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
 PLAIN_OK = b"ok\n"
@@ -286,6 +287,8 @@ class Link(Recovery):
 
     def _reply(self, raw: bytes, now_s: float) -> None:
         reply = parse_reply(raw)
+        if isinstance(reply, Unrecognised | Echo) and self._is_refusal(raw):
+            reply = CommandFailed(raw.decode("latin-1").strip(), fatal=False)
         if isinstance(reply, Ok):
             self._on_ok(reply, now_s)
         elif isinstance(reply, Resend):
@@ -337,6 +340,15 @@ class Link(Recovery):
                 self._on_answer(reply, now_s)
             elif isinstance(reply, TemperatureReport) and self._ledger.slow_under_way:
                 self._listen_anew(now_s)  # the reports of M109 and M190
+
+    def _is_refusal(self, raw: bytes) -> bool:
+        """Whether a damaged text repeats the line under way, where no number would tell.
+
+        RepRapFirmware says so of what it cannot read, and `ok` after it.
+        """
+        if self.dialect.verifies or not self.dialect.numbered or self.state is not _WAITING:
+            return False
+        return repeats(raw, self._ledger.data(self._ledger.acked + 1))
 
     def _on_ok(self, ok: Ok, now_s: float) -> None:
         self._events.extend(ok.more)  # type: ignore[arg-type]

@@ -190,6 +190,12 @@ def _error(text: str) -> Reply:
     return CommandFailed(text, fatal=False)
 
 
+def repeats(raw: bytes, line: bytes) -> bool:
+    """Whether a text ends with most of a line that was sent, whatever was damaged of either."""
+    sent = line.strip()
+    return SequenceMatcher(None, raw.rstrip()[-len(sent) :], sent).ratio() >= _ALIKE
+
+
 def _is_damaged_line_error(text: str) -> bool:
     said = text.lower().rstrip("0123456789")
     return any(SequenceMatcher(None, said, one).ratio() >= _ALIKE for one in _LINE_ERRORS)

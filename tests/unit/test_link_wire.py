@@ -23,6 +23,7 @@ from gcode.hosts.journal import Journal
 from gcode.hosts.port import PrintReport
 from gcode.hosts.resume import resume
 from gcode.hosts.serial import SerialPrinter
+from gcode.protocol import Link
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -157,6 +158,23 @@ def test_a_bad_command_is_one_though_it_repeats_what_no_text_is() -> None:
     assert not said.fatal
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"Eror: Bad command: \x0e1 G1 X25 Y20.00 E0.03*67",
+        b"Errr: Bd comand: N G1 X2 Y20.00 E0.03*7",
+    ],
+)
+def test_a_text_that_repeats_the_line_is_its_refusal_whatever_is_damaged(said: bytes) -> None:
+    """Seeds 61826 and 64601: it was passed over, its `ok` taken for the line's."""
+    link = Link("reprap")
+    link.hello(0.0)
+    link.receive(b"ok\n", 0.0)
+    link.send("G1 X25 Y20.00 E0.03", 0.0)
+    events = link.receive(b"Printing paused*67\n" + said + b"\nok\n", 0.1)
+    assert [event.acked for event in events if isinstance(event, ev.CommandFailed)] == [0]
+
+
 def test_a_runaway_is_fatal_though_a_letter_is_missing() -> None:
     said = parse_reply(b"Error: Thermal Runawa, system stopped! Heater_ID: E0")
     assert isinstance(said, ev.CommandFailed)
@@ -184,7 +202,8 @@ def test_what_waited_in_a_printer_that_started_anew_without_a_word_is_not_execut
 def test_a_report_that_lost_a_digit_makes_no_heater_cold() -> None:
     """It has no checksum: `/205.0` had become `/0.0` on its way, and the nozzle was called off."""
     off, on = b"ok T:205.0 /0.0 B:60.0 /0.0\n", b"ok T:205.0 /205.0 B:60.0 /0.0\n"
-    for reports in ([off, *9 * [on]], [on, off, *9 * [on]]):
+    nameless = b"ok B60.0 /60.0 T0:205.0 /0.0\n"  # twice in a row, seed 62773
+    for reports in ([off, *9 * [on]], [on, off, *9 * [on]], 9 * [nameless]):
         said, _ = answering(iter(reports))
         assert "heaters off" not in said
 
