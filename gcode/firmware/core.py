@@ -225,10 +225,10 @@ class FirmwareCore:
 
     def _ok(self, faults: dict[str, Fault]) -> None:
         text = "ok" + self.machine.ok_text
-        self.machine.ok_text = ""
-        if self._advanced_ok:
+        if self._advanced_ok and not self.machine.ok_text:  # M105 says an `ok` of its own
             free = 15 - len(self.machine.planner.blocks)
-            text = f"ok N{self._wait_number} P{max(free, 0)} B3" + text[2:]
+            text = f"ok N{self._wait_number} P{max(free, 0)} B3"
+        self.machine.ok_text = ""
         if not faults:
             self._out += text.encode() + b"\n"
             return

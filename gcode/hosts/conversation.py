@@ -16,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import eq
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -40,6 +41,8 @@ UNREADABLE_BYTES, UNREADABLE_SHARE = 64, 0.25
 """Bytes to judge by, and the share of them that is no text's: of random ones 0.62 is none."""
 WIRE_FAULTS = (ev.LineError, ev.ResendRequested, ev.ResendRefused, ev.UnknownCommand)
 """What is said after bytes were damaged on their way to the printer."""
+ALIKE_C = 3.0
+"""No heater changes as much from one report to the next; a digit more or less is ten times that."""
 PROOF_QUIET_S = 0.2
 """A printer that has said nothing for so long has nothing left to say."""
 
@@ -52,6 +55,15 @@ def _no_port(error: OSError) -> str:
     if error.errno == errno.EACCES:
         return f"{why}; have your user added to the group that owns it (dialout, mostly)"
     return f"{why}; check the path, the cable and the printer's switch"
+
+
+def _alike(one: ev.TemperatureReport, other: ev.TemperatureReport) -> bool:
+    """Whether two reports a moment apart tell of the same heaters, as no wire damaged them."""
+    return one.heaters.keys() == other.heaters.keys() and all(
+        heater.target_c == other.heaters[name].target_c
+        and abs(heater.current_c - other.heaters[name].current_c) <= ALIKE_C
+        for name, heater in one.heaters.items()
+    )
 
 
 def unreadable(said: bytes) -> bool:
@@ -119,8 +131,8 @@ class SerialConversation:
     def _on_other_event(self, event: ev.Event) -> None:
         """Take note of an event that the conversation itself has no use for."""
 
-    def _fault(self, text: str) -> Exception:
-        return LinkError(f"The printer reports a fault: {text}.")
+    def _fault(self, failed: ev.CommandFailed) -> Exception:
+        return LinkError(f"The printer reports a fault: {failed.text}.")
 
     def _lost_error(self, why: str) -> LinkLostError:
         return LinkLostError(f"The link to {self.port} is lost: {why}.", -1, -1, why=why)
@@ -235,13 +247,18 @@ class SerialConversation:
         """How the firmware speaks."""
         return self._link.dialect
 
+    @property
+    def forgot(self) -> bool:
+        """Whether the printer has stopped or started anew: what waited in its buffers is gone."""
+        return self._link.forgot
+
     def capabilities(self) -> Capabilities:
         """Return what the firmware said on connecting."""
         return self._capabilities
 
     def temperatures(self) -> Temperatures:
         """Ask for temperatures (M105)."""
-        report = self._answer("M105", lambda: self._temperatures, "temperatures")
+        report = self._agreed("M105", lambda: self._temperatures, "temperatures", _alike)
         hotend, bed = report.hotend, report.heaters.get("B")
         if hotend is None:
             raise LinkError("The printer reports no hotend temperature; check its firmware.")
@@ -277,14 +294,28 @@ class SerialConversation:
         return self._where()
 
     def _where(self) -> ev.PositionReport:
-        """The position that two reports in a row agree on: a report has no checksum."""
+        return self._agreed("M114", lambda: self._position, "position", eq)
+
+    def _targets_c(self) -> dict[str, float | None]:
+        """What the heaters aim at, by the names that the printer gives them."""
+        report = self._agreed("M105", lambda: self._temperatures, "temperatures", _alike)
+        return {name: heater.target_c for name, heater in report.heaters.items()}
+
+    def _agreed(
+        self,
+        command: str,
+        read: Callable[[], Answer | None],
+        what: str,
+        alike: Callable[[Answer, Answer], bool],
+    ) -> Answer:
+        """What two reports in a row agree on: a report has no checksum."""
         before = None
         for _ in range(REPORT_TRIES):
-            report = self._answer("M114", lambda: self._position, "position")
-            if report == before:
+            report = self._answer(command, read, what)
+            if before is not None and alike(report, before):
                 return report
             before = report
-        raise LinkError("The printer reports another position each time; let it come to rest.")
+        raise LinkError(f"The printer reports another {what} each time; let it come to rest.")
 
     def _answer(self, command: str, read: Callable[[], Answer | None], what: str) -> Answer:
         for _ in range(REPORT_TRIES):
@@ -303,7 +334,7 @@ class SerialConversation:
             heard: list[ev.Event] = []
             while not self._link.ready:
                 if self._link.ended:  # it would not be ready ever again
-                    self._lost("it has ended")
+                    self._lost(self._link.ended_by or "it has ended")
                 heard += self._pump()
             if command in self._asked:
                 self._asked[command] += 1
@@ -435,6 +466,8 @@ class SerialConversation:
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
+        if self._link.ended:  # somebody has heard why, who was asked meanwhile
+            raise self._lost_error(self._link.ended_by or "it has ended")
         return events
 
     def _lost(self, why: str) -> NoReturn:
@@ -468,7 +501,7 @@ class SerialConversation:
         elif self._failure is not None:
             pass  # the first fault is the cause, the rest its consequences
         elif isinstance(event, ev.CommandFailed):
-            self._failure = self._fault(event.text)
+            self._failure = self._fault(event)
         elif isinstance(event, ev.LinkLost):
             self._failure = self._lost_error(event.why) if self._greeted else self._stranger()
         self._on_other_event(event)

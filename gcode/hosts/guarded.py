@@ -19,7 +19,6 @@ from gcode.hosts.line_query import last_number
 from gcode.hosts.lock import PortLock
 from gcode.hosts.safety import SAFE_COMMANDS, Supervisor
 from gcode.hosts.supervisor import make_safe
-from gcode.protocol import events as ev
 
 _log = logging.getLogger(__name__)
 PAUSE_LIFT_MM = 5.0
@@ -55,7 +54,8 @@ class GuardedConversation(SerialConversation):
         ----------
         before_hello
             Told the number of the last line that the printer has received (None: it does not
-            say), before a hello makes it forget that; what it raises ends the attempt.
+            say), before a hello makes it forget that; what it raises ends the attempt. Given by
+            who goes on with a job: the printer is left safe where the attempt fails.
         """
         if self._serial is not None:
             return
@@ -72,12 +72,20 @@ class GuardedConversation(SerialConversation):
             self._learn()
             self._prove()  # from here on a silent reset cannot be taken for a resend request
         except BaseException:
+            if before_hello is not None:
+                self._leave_cold()
             self.close()
             raise
         if self._line.supervise:
             self._supervisor = Supervisor(
                 self._fd, self._lock.fd, self._journal_path(), self.heads_off()
             )
+
+    def _leave_cold(self) -> None:
+        """Make safe a printer that a job of ours may heat, by whoever cannot go on with it."""
+        if self._serial is not None:
+            lift = not self._link.ended
+            self._told_safe(make_safe(self._fd, lift=lift, heads_off=self.heads_off()))
 
     def _journal_path(self) -> Path | None:
         return self._journal.path if self._journal is not None else None
@@ -94,11 +102,7 @@ class GuardedConversation(SerialConversation):
                     f"{self.port} failed ({error}) when asked for its line number; check the "
                     f"printer and its cable."
                 ) from error
-        try:
-            before_hello(number)
-        except LinkError:
-            self._told_safe(make_safe(self._fd, heads_off=self.heads_off()))
-            raise
+        before_hello(number)
 
     def close(self) -> None:
         """Let go of the printer; heaters stay as they are (`make_safe` switches them off)."""
@@ -145,6 +149,9 @@ class GuardedConversation(SerialConversation):
             if not (ours and self._comes_to_rest() and self._switched_off()):
                 self._go_past()
             self._safe_after = self._bytes_sent
+        except KeyboardInterrupt:  # in the midst of this: once more, past everything
+            self._go_past()
+            raise
         except (LinkError, LocalProtocolError, OSError) as error:
             self._told_safe(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
         finally:
@@ -192,11 +199,14 @@ class GuardedConversation(SerialConversation):
 
     def _heaters_now(self) -> str:
         """What the printer says of its heaters; an `ok` alone confirms nothing."""
-        for event in self._ask("M105"):
-            if isinstance(event, ev.TemperatureReport) and all(
-                heater.target_c == 0.0 for heater in event.heaters.values()
-            ):
-                return "heaters off (the printer reports targets of 0)"
+        try:
+            targets_c = self._targets_c()
+        except LinkError:
+            if self._link.ended:
+                raise
+            targets_c = {}
+        if targets_c and not any(targets_c.values()):
+            return "heaters off (the printer reports targets of 0)"
         return "heaters told to switch off, nothing confirms it"
 
     @property

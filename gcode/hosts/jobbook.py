@@ -42,6 +42,7 @@ class JobBook:
         self._journal = journal
         self._clock = clock
         self._sent: deque[tuple[int, int]] = deque(maxlen=2 * HISTORY_LINES)
+        self._failed_after = math.inf  # the wire number before the line that failed
         self._checked: PrintableProgram | None = None
         self._first = self._end = 0
         self._reserved = 0  # end of the journal's open step; 0 if none is open
@@ -53,6 +54,7 @@ class JobBook:
     def open(self, checked: PrintableProgram, first: int, end: int) -> None:
         """Turn to a new page: lines [first, end) of a program."""
         self._sent.clear()
+        self._failed_after = math.inf
         self._checked = checked
         self._first, self._end = first, end
         self._reserved = self._coming = self.lines_sent = 0
@@ -127,6 +129,10 @@ class JobBook:
 
     # ------------------------------------------------------------------ what is known
 
+    def failed_after(self, number: int) -> None:
+        """Take note that a line after this wire number failed: its `ok` is none of success."""
+        self._failed_after = min(self._failed_after, number)
+
     @property
     def last_sent_line(self) -> int:
         """The last program line sent; the one before the first if none was."""
@@ -134,8 +140,8 @@ class JobBook:
 
     @property
     def acked_line(self) -> int:
-        """The last program line whose number is acknowledged."""
-        acked = self._link.last_acked
+        """The last program line whose number is acknowledged, before any that failed."""
+        acked = min(self._link.last_acked, self._failed_after)
         return next((index for n, index in reversed(self._sent) if n <= acked), self._first - 1)
 
     @property

@@ -122,6 +122,7 @@ class _Resumption:
         self._journal, self._job = self._last_job()
         self._silence_s = 0.0
         self._left_alone = False
+        self._settled = False  # which line is next, by the printer's own word
 
     def run(self, progress: Progress) -> PrintReport:
         """Go on."""
@@ -159,7 +160,8 @@ class _Resumption:
             self._restore(place, modes)
         except LinkLostError as error:  # it knows nothing of the job's lines: none was sent
             printer.make_safe()
-            self._refuse(f"the link was lost again ({error.why})")
+            unsure = printer.forgot or not self._settled
+            self._refuse(f"the link was lost again ({error.why})", reset=unsure)
         except ResumeRefusedError:
             printer.make_safe()
             raise
@@ -201,11 +203,12 @@ class _Resumption:
         if not self._printer.dialect.verifies:
             return
         if number is None:
-            self._refuse("the printer does not say which line it has received")
+            self._refuse("the printer does not say which line it has received", reset=True)
         self._settled_at(self._line_after(number))
 
     def _settled_at(self, line: int) -> None:
         self._journal.settle(self._job.id, line)
+        self._settled = True
         job = self._journal.latest()
         assert job is not None
         self._job = job
@@ -311,7 +314,7 @@ class _Resumption:
     def _refuse(self, why: str, *, reset: bool = False) -> NoReturn:
         job = self._job
         known = job.acked - 1
-        if reset:  # what waited in its buffers is gone
+        if reset or job.phase == "forgotten":  # what waited in its buffers may be gone
             most = self._printer.dialect.buffered_lines
             known = before_commands(self._checked, job.first_line, job.acked, most) - 1
         sent = max(job.reserved - 1, known)
@@ -342,8 +345,13 @@ class _Resumption:
 
     def _restore(self, place: PositionReport, modes: Modes) -> None:
         """Lift, heat, go back to where the job left off, modes and extruder as it left them."""
-        tell = self._printer.command
         known = modes.position_mm
+
+        def tell(command: str) -> None:
+            if self._printer.abort_asked:
+                self._refuse("somebody has ended it meanwhile")
+            self._printer.command(command)
+
         tell("G21")
         if place.z_mm < known["Z"] + PAUSE_LIFT_MM / 2:
             lift_mm = max(PAUSE_LIFT_MM, known["Z"] - place.z_mm)

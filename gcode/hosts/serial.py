@@ -97,6 +97,11 @@ class SerialPrinter(GuardedConversation):
         self.connect()
         return self
 
+    def close(self) -> None:
+        """Let go of the printer, and of what somebody wanted of this conversation."""
+        self._abort_asked.clear()
+        super().close()
+
     # ------------------------------------------------------------------ printing
 
     def print(
@@ -117,7 +122,6 @@ class SerialPrinter(GuardedConversation):
         before = (self._link.resends, self._stalls, self._link.spare_oks, self._bytes_sent)
         self._round_trips = RoundTrips()
         self._warnings.clear()
-        self._abort_asked.clear()
         self._book.open(checked, first, end)
         self._printing = True
         try:
@@ -136,6 +140,7 @@ class SerialPrinter(GuardedConversation):
             if self._log is not None:
                 self._log.flush()
         if not whole:
+            self._abort_asked.clear()
             self.make_safe()
         return PrintReport(
             ok=whole,
@@ -150,6 +155,14 @@ class SerialPrinter(GuardedConversation):
             warnings=tuple(self._warnings),
             first_line=first,
         )
+
+    def finish_moves(self) -> None:
+        """Return when every buffered move has been made."""
+        try:
+            super().finish_moves()
+        except LinkError:
+            self._book.lost()  # all are received, and perhaps not made
+            raise
 
     def _note_temperatures(self, now_s: float) -> None:
         self._ask_s = now_s + TEMPERATURE_EVERY_S
@@ -340,12 +353,20 @@ class SerialPrinter(GuardedConversation):
         self._go_on.set()
 
     def abort(self) -> None:
-        """End the job: nothing more is sent, heaters off, nozzle lifted."""
+        """End the job: nothing more is sent, heaters off, nozzle lifted.
+
+        Between two parts of a job the next one ends at once.
+        """
         self._abort_asked.set()
         self._attention.set()
         self._go_on.set()
         if not self._printing:
             self.make_safe()
+
+    @property
+    def abort_asked(self) -> bool:
+        """Whether somebody has ended the job, and no `print` has ended over it yet."""
+        return self._abort_asked.is_set()
 
     def _attend(self, checked: PrintableProgram, line: int) -> bool:
         """Do what was asked for meanwhile; False on abort."""
@@ -413,14 +434,15 @@ class SerialPrinter(GuardedConversation):
             asked = {"pause": self.pause, "resume": self.resume, "cancel": self.abort}
             asked.get(event.action.split()[0], lambda: None)()
 
-    def _fault(self, text: str) -> Exception:
+    def _fault(self, failed: ev.CommandFailed) -> Exception:
+        self._book.failed_after(failed.acked)
         where = ""
         if self._printing:
             where = (
                 f"; the last program line known to be executed is {self._book.executed_line + 1}"
                 f"{self._forgotten()}"
             )
-        return PrinterError(f"The printer reports a fault: {text}{where}.")
+        return PrinterError(f"The printer reports a fault: {failed.text}{where}.")
 
     def _forgotten(self) -> str:
         """What may have become of the lines after the last that is known to be executed."""

@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 
 HEATERS_OFF = (b"M104 S0", b"M140 S0")
+_OFF = dict(zip((b"T", b"B"), HEATERS_OFF, strict=True))
 END_WAIT = b"M108"
 """Ends a wait for temperature, where the firmware lets it pass the queue."""
 LIFT = (
@@ -23,8 +24,8 @@ LIFT = (
     b"G1 Z5 F600",
     b"G90",
 )
-QUESTIONS = 3
-_TARGET = re.compile(rb"\b(T\d{0,2}|B): ?-?[\d.]+ ?/ ?(-?[\d.]+)")
+QUESTIONS = 6
+_TARGET = re.compile(rb"\b([A-Z]\d{0,2}): ?-?[\d.]+ ?/ ?(-?[\d.]+)")
 _KLIPPER_REFUSES = re.compile(rb"^!! *(.+?)\r?$", re.MULTILINE)
 _NOT_MOVED = re.compile(rb"^(?:!!|Error:)", re.MULTILINE)
 _KLIPPER_STARTS = re.compile(rb"^ok T:0\r?$", re.MULTILINE)
@@ -86,32 +87,46 @@ def make_safe(port_fd: int, *, lift: bool = True, heads_off: Sequence[str] = ())
 def confirmed_off(port_fd: int) -> bool:
     """Whether the printer itself reports that its heaters aim at 0.
 
-    An `ok` proves nothing: it may answer a line of the dead sender's. A Klipper that starts anew
-    is asked until it is there.
+    An `ok` proves nothing: it may answer a line of the dead sender's. Nor does one report, which
+    has no checksum: two in a row must say the same. A Klipper that starts anew is asked until it
+    is there.
     """
     asked, starts, until_s = 0, False, time.monotonic() + STARTS_S
-    while asked < QUESTIONS or (starts and time.monotonic() < until_s):
-        asked += 1
+    before: dict[bytes, bytes] = {}
+    while asked < QUESTIONS and not (starts and time.monotonic() > until_s):
         if not write(port_fd, b"M105\n"):
             return False
         heard = wait(port_fd, PORT_ANSWERS_S)[1]
-        targets = dict(_TARGET.findall(heard))
-        if any(name.startswith(b"T") for name in targets):
+        targets = targets_of(heard)
+        if targets and targets == before:
             on = [name for name, value in targets.items() if float(value) != 0.0]
-            if not on or not send_off(port_fd, on):
-                return not on
-        if starts := _KLIPPER_STARTS.search(heard) is not None:
+            if not on:
+                return True
+            send_off(port_fd, on)
+        before = targets
+        starts = _KLIPPER_STARTS.search(heard) is not None
+        if starts:
             time.sleep(PORT_ANSWERS_S)
+        else:
+            asked += 1
     return False
 
 
-def send_off(port_fd: int, on: list[bytes]) -> bool:
-    """Switch off heads that nobody had told of; whether there is one among what is on."""
-    heads = [name for name in on if name[1:]]
-    for name in heads:
-        write(port_fd, b"M104 %s S0\n" % name)
+def targets_of(heard: bytes) -> dict[bytes, bytes]:
+    """What the last report says that nozzles and bed aim at; nothing where it is damaged."""
+    for line in reversed(heard.split(b"\n")):
+        targets = _TARGET.findall(line)
+        heaters = {name: value for name, value in targets if name[:1] in b"TB"}
+        if any(name[:1] == b"T" for name in heaters):
+            return heaters if line.count(b"/") == len(targets) else {}
+    return {}
+
+
+def send_off(port_fd: int, on: list[bytes]) -> None:
+    """Switch off what is on all the same: heads that nobody had told of, or a line was damaged."""
+    for name in on:
+        write(port_fd, _OFF.get(name, b"M104 %s S0" % name) + b"\n")
         wait(port_fd, PORT_ANSWERS_S)
-    return bool(heads)
 
 
 def write(port_fd: int, data: bytes) -> bool:

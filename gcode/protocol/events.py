@@ -98,11 +98,13 @@ class LineError:
 class CommandFailed:
     """The printer could not carry out a command (`Error:`, `!!`); an `ok` may follow all the same.
 
-    `fatal` is True where the firmware says that it has stopped for good.
+    `fatal` is True where the firmware says that it has stopped for good. When it was said, every
+    line up to `acked` was acknowledged: what failed is none of these.
     """
 
     text: str
     fatal: bool
+    acked: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from gcode.protocol.belief import ResendVerdict
 from gcode.protocol.events import (
     Busy,
     CommandFailed,
+    Echo,
     Event,
     Greeted,
     LineError,
@@ -44,7 +45,7 @@ from gcode.protocol.events import (
 )
 from gcode.protocol.lines import WireLine, WireLines, wire_line
 from gcode.protocol.recovery import NEVER_S, Recovery
-from gcode.protocol.replies import parse_reply
+from gcode.protocol.replies import parse_reply, repeats
 from gcode.protocol.transitions import TRANSITIONS, Signal, State
 
 PLAIN_OK = b"ok\n"
@@ -239,7 +240,7 @@ class Link(Recovery):
         if not self.dialect.verifies:
             raise LocalProtocolError(f"{self.dialect.name} verifies no line numbers.")
         self._go(Signal.ASK)
-        self._questions = 0
+        self._questions, self._heard_s = 0, now_s
         self._said_last = self._belief.told_place = None
         self._ask_place(now_s)
         return self.take_output()
@@ -250,6 +251,8 @@ class Link(Recovery):
 
     def receive(self, data: bytes, now_s: float) -> list[Event]:
         """Take bytes from the printer and return what they mean; any bytes at all are fine."""
+        if self.state is _ASKING:
+            self._questions, self._heard_s = self._questions + 1, now_s
         for raw, readable in self._inbox.take(data):
             if readable:
                 self._reply(raw, now_s)
@@ -284,6 +287,8 @@ class Link(Recovery):
 
     def _reply(self, raw: bytes, now_s: float) -> None:
         reply = parse_reply(raw)
+        if isinstance(reply, Unrecognised | Echo) and self._is_refusal(raw):
+            reply = CommandFailed(raw.decode("latin-1").strip(), fatal=False)
         if isinstance(reply, Ok):
             self._on_ok(reply, now_s)
         elif isinstance(reply, Resend):
@@ -301,6 +306,8 @@ class Link(Recovery):
             self._said_last = reply.last
             if self.state is _GREETING:
                 self._refuse_greeting(now_s)
+            elif self.dialect.verifies:  # the request that follows may be garbled, its `ok` not
+                self._swallow_until_s = now_s + self.timing.resend_grace_s
             # Some ask for no resend (OctoPrint#2226); the others' request follows at once.
             self._doubt(now_s, self.timing.resend_grace_s)
         elif isinstance(reply, PrinterReset):
@@ -312,11 +319,11 @@ class Link(Recovery):
                 self._shut_down = True
                 self._out += b"\n"  # answered with the cause, as anything is from now on
         elif isinstance(reply, CommandFailed):
-            if self._shut_down:
-                reply = CommandFailed(f"Klipper has shut down: {reply.text}", fatal=True)
-            self._events.append(reply)
+            why = f"Klipper has shut down: {reply.text}" if self._shut_down else reply.text
+            fatal = reply.fatal or self._shut_down
+            self._events.append(CommandFailed(why, fatal, self._ledger.acked))
             self._ledger.fail()
-            if reply.fatal and Signal.HALT in TRANSITIONS[self.state]:
+            if fatal and Signal.HALT in TRANSITIONS[self.state]:
                 self._go(Signal.HALT)
         elif isinstance(reply, UnknownCommand) and "*" in reply.text:
             # A numbered line whose N was lost: taken for a command without number, checksum
@@ -333,6 +340,15 @@ class Link(Recovery):
                 self._on_answer(reply, now_s)
             elif isinstance(reply, TemperatureReport) and self._ledger.slow_under_way:
                 self._listen_anew(now_s)  # the reports of M109 and M190
+
+    def _is_refusal(self, raw: bytes) -> bool:
+        """Whether a damaged text repeats the line under way, where no number would tell.
+
+        RepRapFirmware says so of what it cannot read, and `ok` after it.
+        """
+        if self.dialect.verifies or not self.dialect.numbered or self.state is not _WAITING:
+            return False
+        return repeats(raw, self._ledger.data(self._ledger.acked + 1))
 
     def _on_ok(self, ok: Ok, now_s: float) -> None:
         self._events.extend(ok.more)  # type: ignore[arg-type]
@@ -395,7 +411,7 @@ class Link(Recovery):
         else:
             self._events.append(ResendRefused(number, why))
         if verdict is ResendVerdict.END:
-            self._lose(why)
+            self._lose_place(number, why)
         elif verdict is not ResendVerdict.SERVE:
             # The request itself may be garbled: ask again before believing it.
             self._swallow_until_s = now_s + self.timing.resend_grace_s

@@ -46,6 +46,7 @@ class Recovery:
         self.window = window
         self.timing = timing or LinkTiming()
         self.state = State.UNGREETED
+        self.ended_by = ""
         self.resends = 0
         self.spare_oks = 0
         self._inbox = Inbox()
@@ -141,19 +142,23 @@ class Recovery:
             self._serve(number, now_s)
         elif judgement.verdict is ResendVerdict.END:
             self._events.append(ResendRefused(number, judgement.why))
-            self._lose(judgement.why)
+            self._lose_place(number, judgement.why)
         else:
             self._events.append(ResendRefused(number, judgement.why or "it said so once only"))
             self._deadline_s = now_s + self.timing.resend_grace_s
 
     def _ask_place(self, now_s: float) -> None:
-        """Put a line on the wire that must bounce; its refusal tells what was taken last."""
-        if self._questions >= self.timing.max_questions:
+        """Put a line on the wire that must bounce; its refusal tells what was taken last.
+
+        Answers that are damaged are counted; one that says nothing is given time, as everywhere.
+        """
+        silent_s = now_s - self._heard_s
+        if self._questions >= self.timing.max_questions or silent_s >= self.timing.give_up_s:
             self._lose("the printer does not say which line it took last")
             return
-        self._questions += 1
         self._out += b"\n" + numbered(self._ledger.last + 1 + _BOUNCES_AHEAD, b"M105")
-        self._deadline_s = now_s + self.timing.doubt_s
+        wait_s = min(max(silent_s, self.timing.doubt_s), self.timing.silence_s)
+        self._deadline_s = now_s + wait_s
 
     def _rewind(self, now_s: float) -> None:
         """Send again from the line asked for, now that all older answers are in."""
@@ -288,9 +293,18 @@ class Recovery:
 
     def _lose(self, why: str, signal: Signal = Signal.GIVE_UP) -> None:
         self._go(signal)
+        self.ended_by = why
         self._deadline_s = NEVER_S
         self._out.clear()
         self._events.append(LinkLost(why, self._ledger.acked, self._ledger.last))
+
+    def _lose_place(self, number: int, why: str) -> None:
+        """End the link over a request for a line.
+
+        Who wants one again that it is proved to have taken has started anew without a word.
+        """
+        self._reset = self._reset or number <= self._belief.proven
+        self._lose(why)
 
     def _go(self, signal: Signal) -> None:
         try:

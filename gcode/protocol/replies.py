@@ -48,6 +48,8 @@ _CAPABILITY = re.compile(r"Cap:([A-Z0-9_]{1,40}):([01])")
 _FIRMWARE_NAME = re.compile(r"FIRMWARE_NAME:\s*(\S[^:]*?)(?:\s+[A-Z_]+:.*)?$")
 _ACTION = re.compile(r"//\s?action:\s*(\S.*)")
 _UNKNOWN_COMMAND = re.compile(r"(?:echo:\s*|//\s*)?unknown command:.*", re.IGNORECASE | re.DOTALL)
+_BAD_COMMAND = re.compile(r"error:\s*bad command:.*", re.IGNORECASE | re.DOTALL)
+"""RepRapFirmware's words for it; what it repeats after them is what arrived, any bytes at all."""
 
 # What firmwares print as they boot: Marlin `start`, reset causes (`setup()` of MarlinCore),
 # Repetier the same; Klipper tells of its restart with `// Klipper state:`; RepRap.cpp of
@@ -76,8 +78,8 @@ _LAST_LINE = re.compile(r"last line: ?(\d{1,9})", re.IGNORECASE)
 # Errors that no command of ours caused and that hurt no print (Marlin, SD card).
 _HARMLESS_ERROR = re.compile(r"volume\.init|openRoot|SD card|workDir|no media", re.IGNORECASE)
 _FATAL = re.compile(
-    r"halted|kill|thermal runaway|heating failed|m[ai][xn]temp|watchdog|overtemp|undertemp"
-    r"|malfunction|shutdown|emergency",
+    r"halted|kill|thermal runaway|system stopped|heating failed|m[ai][xn]temp|watchdog|overtemp"
+    r"|undertemp|malfunction|shutdown|emergency",
     re.IGNORECASE,
 )
 _PRINTABLE = re.compile(rb"[\t\x20-\x7e\xb0\xc2]*")
@@ -99,7 +101,9 @@ def parse_reply(raw: bytes) -> Reply:
         return Ok()
     if _PRINTABLE.fullmatch(raw) is None:
         text = raw.decode("latin-1").strip()
-        return UnknownCommand(text) if _UNKNOWN_COMMAND.fullmatch(text) else Unrecognised(raw)
+        if _UNKNOWN_COMMAND.fullmatch(text):
+            return UnknownCommand(text)
+        return _error(text[6:].strip()) if _BAD_COMMAND.fullmatch(text) else Unrecognised(raw)
     text = raw.decode("latin-1").strip()
     if not text:
         return Echo("")
@@ -184,6 +188,12 @@ def _error(text: str) -> Reply:
     if text.lower().startswith("unknown command"):
         return UnknownCommand(text)
     return CommandFailed(text, fatal=False)
+
+
+def repeats(raw: bytes, line: bytes) -> bool:
+    """Whether a text ends with most of a line that was sent, whatever was damaged of either."""
+    sent = line.strip()
+    return SequenceMatcher(None, raw.rstrip()[-len(sent) :], sent).ratio() >= _ALIKE
 
 
 def _is_damaged_line_error(text: str) -> bool:

@@ -5,9 +5,16 @@
 
    line 4k+1 steps axis k, 4k+2 is its direction, 4k+3 its end stop, at its lowest end;
    line 13 is a probe: it triggers FELT_STEPS (of the environment) above Z's end stop and below;
+   line 21 steps the extruder;
    line 23 heats the nozzle (analog 0), line 24 the bed (analog 1).
 
    A heater is a first-order system; an analog value is linear, 0 to 400 degrees.
+
+   A board's own clock drives its steps; this one's is the machine's, which gives it a turn when it
+   likes: 1 ms late in the midst of a move, and the program shuts down (Stepper too far in past).
+   So while it steps, its clock waits for it: it goes on no further than LATE_S past what was due,
+   or since it was last asked. What it so loses to the machine's clock, milliseconds in a minute,
+   klippy takes for a slow quartz.
 
        cc -shared -fPIC -O2 -o pins.so klipper_pins.c -ldl */
 
@@ -24,9 +31,10 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { FDS = 1024, LINES = 64, AXES = 3, PROBE = 13, NOZZLE = 23, BED = 24 };
+enum { FDS = 1024, LINES = 64, AXES = 3, PROBE = 13, PUSHES = 21, NOZZLE = 23, BED = 24 };
 static const char GPIO[] = "/dev/gpiochip0";
 static const char ANALOG[] = "/sys/bus/iio/devices/iio:device0/in_voltage";
+static const double LATE_S = 2e-4, STEPS_S = 0.05;
 static const double ROOM_C = 22.0, HIGHEST_C = 400.0, HIGHEST_VALUE = 4095.0;
 
 static struct { int is_line, line, is_input, input; } opened[FDS];
@@ -38,11 +46,54 @@ static struct heater { int line; double gain_c_s, fade_s, at_c, since_s; } heate
     {BED, 5.0, 120.0, 22.0, 0.0},
 };
 
+enum { SECOND_NS = 1000000000 };
+static long long lost_ns, due_ns, told_ns, stepped_ns;  /* the last three by its own clock */
+
+static long long ns_of(struct timespec t)
+{
+    return t.tv_sec * (long long)SECOND_NS + t.tv_nsec;
+}
+
+static struct timespec from_ns(long long ns)
+{
+    return (struct timespec){ns / SECOND_NS, ns % SECOND_NS};
+}
+
+int clock_gettime(clockid_t clock, struct timespec *into)
+{
+    static int (*real)(clockid_t, struct timespec *);
+    if (!real)
+        real = dlsym(RTLD_NEXT, "clock_gettime");
+    int failed = real(clock, into);
+    if (failed || clock != CLOCK_MONOTONIC)
+        return failed;
+    long long now_ns = ns_of(*into) - lost_ns;
+    long long most_ns = (due_ns > told_ns ? due_ns : told_ns) + (long long)(LATE_S * SECOND_NS);
+    int steps_now = stepped_ns && told_ns - stepped_ns < (long long)(STEPS_S * SECOND_NS);
+    if (steps_now && now_ns > most_ns) {
+        lost_ns += now_ns - most_ns;
+        now_ns = most_ns;
+    }
+    told_ns = now_ns;
+    *into = from_ns(now_ns);
+    return 0;
+}
+
+int timer_settime(timer_t timer, int flags, const struct itimerspec *when, struct itimerspec *was)
+{
+    static int (*real)(timer_t, int, const struct itimerspec *, struct itimerspec *);
+    if (!real)
+        real = dlsym(RTLD_NEXT, "timer_settime");
+    due_ns = ns_of(when->it_value);
+    struct itimerspec then = {when->it_interval, from_ns(due_ns + lost_ns)};
+    return real(timer, flags, &then, was);
+}
+
 static double now_s(void)
 {
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
-    return t.tv_sec + t.tv_nsec * 1e-9;
+    return ns_of(t) * 1e-9;
 }
 
 static void warm(struct heater *h)
@@ -61,6 +112,8 @@ static void write_line(int line, int value)
             warm(&heaters[k]);
     if (axis < AXES && line % 4 == 1 && value && !level[line])
         steps[axis] += level[line + 1] ? 1 : -1;
+    if ((axis < AXES || line == PUSHES) && line % 4 == 1)
+        stepped_ns = told_ns;
     level[line] = value;
 }
 

@@ -17,7 +17,7 @@ import socket
 import subprocess
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -89,6 +89,8 @@ path: {folder}/gcodes
 FIRST = (("chrt", "-f", "10"), ("-r",)) if os.geteuid() == 0 else ((), ())
 """What comes before klippy, and after the micro-controller's program."""
 ARMED = ("toolhead", "extruder")
+ANSWER_S = 30.0  # a method's, while a macro is carried out
+TOLD_S = 0.75  # bulk_sensor.BATCH_INTERVAL, and half as much again on a machine that is busy
 
 
 def live_klipper() -> tuple[Path, Path]:
@@ -170,7 +172,6 @@ class Api:
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(30.0)
         self._rest = b""
         self.unasked: list[dict[str, Any]] = []
         try:
@@ -183,6 +184,8 @@ class Api:
         return self
 
     def __exit__(self, *error: object) -> None:
+        with suppress(OSError):  # Klipper may have gone first
+            self._socket.shutdown(socket.SHUT_RDWR)  # who listens hears of it
         self._socket.close()
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
@@ -194,8 +197,9 @@ class Api:
         assert "result" in answer, answer
         return dict(answer["result"])
 
-    def hear(self) -> dict[str, Any]:
-        """The next message."""
+    def hear(self, *, asked: bool = True) -> dict[str, Any]:
+        """The next message; one that nobody asked for may take hours."""
+        self._socket.settimeout(ANSWER_S if asked else None)
         while b"\x03" not in self._rest:
             data = self._socket.recv(65536)
             if not data:
@@ -210,13 +214,19 @@ class Api:
 
 
 class Moves:
-    """What Klipper has its tool head and its extruder do, by its own `motion_report`."""
+    """What Klipper has its tool head and its extruder do, by its own `motion_report`.
+
+    Each of the two is told by itself, every half a second: what one was told of may be the other's
+    next message.
+    """
 
     def __init__(self, path: Path) -> None:
         self._api = Api(path)
         self._lock = threading.Lock()
         self._at = [0.0, 0.0, 0.0]
         self._told: dict[str, list[list[Any]]] = {name: [] for name in ARMED}
+        self._heard: list[tuple[float, float]] = []
+        self._lost: Exception | None = None
         for name in ARMED:
             self._api.call("motion_report/dump_trapq", name=name, response_template={"armed": name})
         self._thread = threading.Thread(target=self._listen, daemon=True)
@@ -227,21 +237,34 @@ class Moves:
 
     def __exit__(self, *error: object) -> None:
         self._api.__exit__()
+        self._thread.join()
 
     def _listen(self) -> None:
         try:
             while True:
-                message = self._api.hear()
+                message = self._api.hear(asked=False)
+                told = message["params"]["data"]
                 with self._lock:
-                    self._told[message["armed"]] += message["params"]["data"]
-        except (OSError, ConnectionError):
-            return
+                    self._told[message["armed"]] += told
+                    self._heard.append((time.monotonic(), told[-1][0]))
+        except OSError as lost:
+            self._lost = lost
 
-    def take(self, *, settle_s: float = 1.0) -> MotionBatch:
-        """Everything since the last call; what was moved is told within half a second."""
+    def take(self, *, settle_s: float = 2 * TOLD_S) -> MotionBatch:
+        """Everything since the last call, but for what the other of the two may yet be told of.
+
+        What was moved `2 * TOLD_S` ago has been told by both.
+        """
         time.sleep(settle_s)
+        if self._lost is not None:
+            raise ConnectionError("Klipper tells its moves no more") from self._lost
         with self._lock:
-            told, self._told = self._told, {name: [] for name in ARMED}
+            sure_s = time.monotonic() - TOLD_S
+            until = max((last for at_s, last in self._heard if at_s <= sure_s), default=-math.inf)
+            self._heard = [heard for heard in self._heard if heard[0] > sure_s]
+            told = {name: [row for row in self._told[name] if row[0] <= until] for name in ARMED}
+            for name in ARMED:
+                self._told[name] = [row for row in self._told[name] if row[0] > until]
         rows: dict[float, list[float]] = {}
         for row in told["toolhead"]:
             start, end, speed = _ends(row)

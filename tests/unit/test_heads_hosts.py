@@ -91,7 +91,8 @@ def test_a_killed_sender_s_supervisor_switches_every_head_off(firmware: str) -> 
     ("reports", "off"),
     [
         (
-            [b"ok T:9 /0 B:9 /0 T0:201 /200 T1:9 /0\n", b"ok T:9 /0 B:9 /0 T0:201 /0 T1:9 /0\n"],
+            [b"ok T:9 /0 B:9 /0 T0:201 /200 T1:9 /0\n"] * 2
+            + [b"ok T:9 /0 B:9 /0 T0:201 /0 T1:9 /0\n"] * 2,
             True,
         ),
         ([b"ok T:9 /0 B:9 /0 T0:9 /0 T1:201 /200\n"] * 9, False),

@@ -93,7 +93,7 @@ def test_an_interrupt_in_the_middle_of_a_line_lifts_the_nozzle(tmp_path: Path) -
     assert len(printed) < len(lines)
     assert printed == lines[: len(printed)]
     assert (state["hotend_target_c"], state["bed_target_c"]) == (0, 0)
-    assert told[-5:] == ["G21", "G91", "G1 Z5 F600", "G90", "M105"]
+    assert told[-6:] == ["G21", "G91", "G1 Z5 F600", "G90", "M105", "M105"]
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_an_answer_that_an_interrupt_took_away_is_asked_for_again(tmp_path: Path
             assert os.read(printer._fd, 100) == b"ok\n"
         printer.make_safe()
         assert printer.notes[-1].endswith("nozzle lifted")
-        assert it.told()[-5:] == ["G21", "G91", "G1 Z5 F600", "G90", "M105"]
+        assert it.told()[-6:] == ["G21", "G91", "G1 Z5 F600", "G90", "M105", "M105"]
         assert it.told().count("G1 X5") == 1
 
 

@@ -94,7 +94,7 @@ def test_a_klipper_that_starts_anew_is_asked_until_it_knows(
 ) -> None:
     """regression: "nothing confirms it", a second before it said so; and no nozzle was lifted."""
     monkeypatch.setattr(supervisor, "PORT_ANSWERS_S", 0.05)
-    reports = iter([*5 * [b"ok T:0\n"], b"ok B:60.0 /0.0 T0:201.1 /0.0\n"])
+    reports = iter([*5 * [b"ok T:0\n"], *2 * [b"ok B:60.0 /0.0 T0:201.1 /0.0\n"]])
     said, _ = answering(reports, to_commands=b"!! Printer is not ready\nok\n")
     assert said == "heaters off (the printer reports targets of 0)"
 
