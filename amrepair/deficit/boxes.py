@@ -27,10 +27,8 @@ class Sought:
     Attributes
     ----------
     gone
-        Lines of the job that are not there; None where there are none, and for excess.
-    by_rays
-        Stretches of them of which rays alone say so: the nearest planes are those of what lies
-        below and beside, which stands as designed, and say nothing of the line.
+        Lines of the job that are not there; None where there are none, and for excess. There rays
+        speak: the nearest planes are those of what lies below and beside, and stand as designed.
     """
 
     template: Template
@@ -38,7 +36,6 @@ class Sought:
     anomaly: AnomalyMap
     label: Label
     gone: PlannedBeads | None
-    by_rays: PlannedBeads | None
     options: DeficitOptions
 
     @property

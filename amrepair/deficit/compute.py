@@ -157,7 +157,7 @@ def compute_deficit(
     if anomaly is None or anomaly.evidence is None or anomaly.surfel_label is None:
         anomaly = detect(scan, template)
     template = anomaly.expected(template)
-    evidence, lines, by_rays = _evidence_of(scan, template, anomaly, beads, options.skipped)
+    evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
     deviation_mm = anomaly.deviation_mm
     look = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
@@ -165,8 +165,8 @@ def compute_deficit(
         options=options.heights,
     )  # fmt: skip
     sought = [
-        Sought(template, evidence, anomaly, label, *gone, options)
-        for label, gone in ((Label.MISSING, (lines, by_rays)), (Label.EXCESS, (None, None)))
+        Sought(template, evidence, anomaly, label, gone, options)
+        for label, gone in ((Label.MISSING, lines), (Label.EXCESS, None))
     ]
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
         many = _roughly_missing(anomaly, evidence) > options.early_mm3
@@ -206,22 +206,19 @@ def _evidence_of(
     anomaly: AnomalyMap,
     beads: PlannedBeads | None,
     options: SkippedOptions,
-) -> tuple[Evidence, PlannedBeads | None, PlannedBeads | None]:
-    """What is known of space, also around lines of the job that are gone; and those lines.
-
-    Of the lines all, and the stretches of which rays alone say that they are gone.
-    """
+) -> tuple[Evidence, PlannedBeads | None]:
+    """What is known of space, also around lines of the job that are gone; and those lines."""
     evidence = anomaly.evidence
     assert evidence is not None
-    # as high as errors reach no line is told
-    if beads is None or anomaly.chance_mm > beads.height_mm.max(initial=0.0):
-        return evidence, None, None
-    lines, by_rays = skipped(beads, scan, evidence, template, options)
+    if beads is None or not len(beads.width_mm):
+        return evidence, None
+    over_mm = anomaly.told_over_mm(float(beads.height_mm.max()))
+    lines = skipped(beads, scan, evidence, template, options, over_mm=over_mm)
     if not len(lines.width_mm):
-        return evidence, None, None
+        return evidence, None
     labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
     about = with_stubs(evidence, lines.samples_mm(options.look_step_mm), labelled)
-    return about, lines, by_rays
+    return about, lines
 
 
 def _in_build_frame(

@@ -99,9 +99,9 @@ def _shown(
     evidence = sought.evidence
     if not sought.is_excess:
         best, cautious = evidence.clearance(samples_mm, f_mm, most_mm)
-        if sought.by_rays is not None:
+        if sought.gone is not None:
             best, held = best.copy(), np.flatnonzero(best < 0)
-            held = held[sought.by_rays.holds(samples_mm[held])]
+            held = held[sought.gone.holds(samples_mm[held])]
             best[held] = np.maximum(best[held], evidence.rays_say(samples_mm[held]))
         return best, cautious
     out_mm = evidence.surface_clearance(samples_mm, f_mm)

@@ -117,8 +117,8 @@ class AnomalyMap:
     calibration, options
         What stood in for the scan's own word on its errors, and what the test was set to.
     chance_mm
-        How far a sound place as wide as the narrowest window may seem to lie below where it is
-        expected, beyond what is allowed: a line of a job that is no higher is not told from errors.
+        By rising width of windows: how far beyond what is allowed sound places may seem to lie too
+        low by chance, in the narrowest; in wider ones, those where the scanner errs most.
     """
 
     points_mm: Points
@@ -142,11 +142,18 @@ class AnomalyMap:
     contradicting: tuple[Contradiction, ...] = ()
     calibration: Calibration | None = None
     options: RegionOptions | None = None
-    chance_mm: float = 0.0
+    chance_mm: tuple[tuple[float, float], ...] = ()
 
     def expected(self, template: Template) -> Template:
         """The template that labels and evidence are held against: as the whole part was made."""
         return as_made(template, self.nuisance)
+
+    def told_over_mm(self, deep_mm: float) -> float:
+        """Over what length something so deep is told from errors; 0: over as little as any is."""
+        far_off = [k for k, (_, off_mm) in enumerate(self.chance_mm) if off_mm > deep_mm]
+        if not far_off:
+            return 0.0
+        return [*(width_mm for width_mm, _ in self.chance_mm), np.inf][far_off[-1] + 1]
 
     def told(self) -> tuple[str, ...]:
         """What belongs to the whole part or to whole views, or was not judged, in sentences."""

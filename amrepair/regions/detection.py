@@ -131,7 +131,7 @@ def detect(
         contradicting=contradicting,
         calibration=test.calibration,
         options=options,
-        chance_mm=_chance_mm(test, calibration, options),
+        chance_mm=_chance_mm(test),
     )
 
 
@@ -182,11 +182,17 @@ def _erratic(levels: tuple[Level, ...], options: RegionOptions) -> bool:
     return min(low, high) > 0 and low + high >= LEAST_PEAKS
 
 
-def _chance_mm(test: Tested, given: Calibration | None, options: RegionOptions) -> float:
-    """How low a sound place may seem to lie by chance; anything, where errors tell no limit."""
-    if test.calibration != given or _erratic(test.levels, options):
-        return np.inf
-    return float(np.median(test.levels[1].chance_mm))
+def _chance_mm(test: Tested) -> tuple[tuple[float, float], ...]:
+    """By rising width of windows, how low sound places may seem to lie by chance.
+
+    In wider windows than the narrowest, what lies far off, where a calibration knows that.
+    """
+    told: list[tuple[float, float]] = []
+    for level in test.levels[1:]:
+        calibrated = bool(told) and test.calibration is not None
+        off_mm = level.far_off_mm[0] if calibrated else np.median(level.chance_mm)
+        told.append((level.scale.width_mm, float(off_mm)))
+    return tuple(told)
 
 
 def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evidence, Numbers]:

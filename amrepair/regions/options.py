@@ -23,20 +23,17 @@ class SkippedOptions:
     joined_mm, straight_on
         A line goes on in the next that begins where it ends, unless it turns there by more than
         45° (cosine): that is a corner, and plastic cuts it.
-    gone_share
-        How far the middle of a bead lies in the open where it is gone, as a share of half its
-        height. Half of its plastic would put it at the surface, and noise is averaged over a
-        stretch.
-    gone_by_both, sure_by_both, most_share
-        Planes over cells round off an edge one bead wide until nothing of it is left, and a pixel
-        beside a silhouette lets rays run past a wall: by both together, rays bounded, and surer
-        somewhere.
-    gone_again, least_again_mm, same_layer_mm
-        In a layer of which a stretch is gone others need less, and may be shorter; but rays alone
-        do not do: between thin walls of infill they say "open" of many.
-    there_share
-        A stretch does not go on where the surface lies, on the whole, so much of half a line or
-        more above its middle: rays alone do not do.
+    gone_share, sure_share
+        How far in the open a bead lies where it is gone, on the whole of a stretch, by the rays
+        that meet its core: −1 on its top, 1 on its floor. Half of its plastic is 0, and pixels
+        beside a silhouette let rays run past a wall. And over half of such a stretch, which must be
+        the surer.
+    least_again_mm, same_layer_mm
+        In a layer of which a stretch is gone others may be shorter.
+    errs_over, errs_along_mm, most_together_mm
+        Rays that end so many heights over a line's middle are errors that count. Where a scanner
+        errs a line is judged over so much at least, as recorded errors that lie far off are no
+        longer, and over so much at most.
     below_line_mm, wall_mm, most_shift_mm, upright_wall
         The walls that tell how far in a line stands: so far below the last lines' middles and so
         deep, as far off as a part shrinks and no farther, and upright (cosine).
@@ -46,9 +43,6 @@ class SkippedOptions:
         What one of all walls' cells is worth, as errors hang together along a wall, and what it
         is off by as beads wander, where all of them tell how much the part is aside or has shrunk;
         and by what share plastic shrinks: one standard deviation.
-    about, top_share
-        Cells about a look that are asked for its line's top; how near to it, as a share of half a
-        line.
     under_share
         Of a line's width: a ray that meets it so near to its middle ends there.
     held_places, alike, there_of_alike
@@ -69,14 +63,10 @@ class SkippedOptions:
     least_stretch_mm: float = 1.5
     joined_mm: float = 1e-3
     straight_on: float = 0.7
-    gone_share: float = 0.4
-    gone_by_both: float = 0.5
-    sure_by_both: float = 0.65
-    most_share: float = 1.5
-    gone_again: float = 0.35
+    gone_share: float = 0.5
+    sure_share: float = 0.65
     least_again_mm: float = 1.0
     same_layer_mm: float = 0.05
-    there_share: float = 0.5
     below_line_mm: float = 0.1
     wall_mm: float = 2.0
     most_shift_mm: float = 0.35
@@ -88,8 +78,9 @@ class SkippedOptions:
     wall_share: float = 0.1
     wall_off_mm: float = 0.1
     shrinks_ratio: float = 0.003
-    about: int = 6
-    top_share: float = 1.0
+    errs_over: float = 2.5
+    errs_along_mm: float = 4.0
+    most_together_mm: float = 10.0
     under_share: float = 0.25
     held_places: int = 5
     alike: int = 200

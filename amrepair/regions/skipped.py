@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Mask, Numbers, Points, Values
-from amrepair.field.as_built import SOLID_MM, Evidence
+from amrepair.field.as_built import Evidence
 from amrepair.field.near import has_near
 from amrepair.frames import box_of, cells_of, unit_vectors
 from amrepair.observe.rays import rays_crossing
@@ -92,8 +92,10 @@ def skipped(
     evidence: Evidence,
     template: Template,
     options: SkippedOptions = USUAL_SKIPPED,
-) -> tuple[PlannedBeads, PlannedBeads]:
-    """Stretches of beads that are not there, and those of them of which rays alone say so.
+    *,
+    over_mm: float = 0.0,
+) -> PlannedBeads:
+    """Stretches of beads that are not there.
 
     Parameters
     ----------
@@ -101,42 +103,37 @@ def skipped(
         What the job has laid last, template frame.
     scan
         In the template's frame, its sensors known; without rays nothing is said.
+    over_mm
+        The scanner errs by a line's height over less: views together tell over so much.
     """
     paths = _Paths.of(beads, options)
     lines, line = paths.lines, paths.line
-    if not evidence.has_rays or not len(line):
-        none = lines.some(np.zeros(len(lines.width_mm), dtype=bool))
-        return none, none
-    # rays alone cost little; only where they say "open" walls and surfaces are asked, too
-    planned = _Looks.planned(paths)
+    planned, together = _Looks.planned(paths), 0
+    if evidence.has_rays and len(line):
+        together = _enough_together(paths, planned, scan, over_mm, options)
+    if not together:
+        return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
+    # the emptiest of all rays cost little; only where they say "open" all of them are asked
     ask = np.flatnonzero(evidence.rays_say(planned.middle_mm) > 0)
     looks = planned.some(ask).as_laid(beads, evidence, template, options)
     ask, looks = ask[looks.rays_mm > 0], looks.some(looks.rays_mm > 0)
-    by_surface = np.full(len(line), -1.0)
-    by_both, by_rays = by_surface.copy(), np.zeros(len(line), dtype=bool)
-    by_surface[ask], by_both[ask], by_rays[ask] = _shares(
-        looks, planned, scan, evidence, template, options
-    )
-    surface_says = _together(by_surface, paths.path, options.looks_together)
-    sure = surface_says >= options.gone_share
-    both = _together(by_both, paths.path, options.looks_together)
-    gone = sure | (both >= options.gone_by_both)
-    sure |= both >= options.sure_by_both
-    kept = paths.kept(gone, sure, np.full(len(line), options.least_stretch_mm))
+    opens = np.full(len(line), -1.0)
+    opens[ask] = _by_views(looks, planned, scan, template, options)
+    less = max(together // 2, options.looks_together)  # over which it must be the surer
+    whole, part = (_together(opens, paths.path, count) for count in (together, less))
+    gone = (whole >= options.gone_share) | (part >= options.sure_share)
+    kept = paths.kept(gone, np.full(len(line), options.least_stretch_mm))
     found = paths.stretches(kept)
     if not len(found.width_mm):
-        return found, found
+        return found
+    # what lies under such a stretch is seen through it
+    gone |= found.holds(planned.middle_mm + 2.0 * planned.half_mm[:, None] * UP) & (part > 0)
     # where the extruder has slipped in a layer it is likelier to have slipped there again
     high_mm, slipped_mm = (np.maximum(b.start_mm[:, 2], b.end_mm[:, 2]) for b in (lines, found))
     off_mm = np.abs(high_mm[:, None] - np.unique(slipped_mm))
     again = (off_mm < options.same_layer_mm).any(axis=1)
-    likely = again[line] & (both >= options.gone_again)
-    sure |= likely & (surface_says > 0)
-    least_mm = np.where(again[line], options.least_again_mm, options.least_stretch_mm)
-    kept = paths.kept(gone | likely, sure, least_mm)
-    grows = np.minimum(by_both, by_surface + options.there_share)
-    kept = paths.grown(kept, grows, options)
-    return paths.stretches(kept), paths.stretches(kept & by_rays)
+    least_mm = np.where(again, options.least_again_mm, options.least_stretch_mm)[line]
+    return paths.stretches(paths.grown(paths.kept(gone, least_mm), opens, options))
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,11 +194,10 @@ class _Paths:
         middle_mm[:, 2] -= 0.5 * lines.height_mm[line]
         return middle_mm
 
-    def kept(self, gone: Mask, sure: Mask, least_mm: Values) -> Mask:
-        """Neighbouring looks that say so, over a length, of which one is sure."""
+    def kept(self, gone: Mask, least_mm: Values) -> Mask:
+        """Neighbouring looks that say so, over a length."""
         a, b = self._runs(gone, self.path)
-        surely = np.concatenate([[0], np.cumsum(sure)])
-        long = ((b - a + 1) * self.step_mm[a] >= least_mm[a]) & (surely[b + 1] > surely[a])
+        long = (b - a + 1) * self.step_mm[a] >= least_mm[a]
         found = np.zeros(len(gone), dtype=bool)
         for first, last in zip(a[long], b[long], strict=True):
             found[first : last + 1] = True
@@ -497,47 +493,62 @@ def _sunk_mm(
     return found_mm
 
 
-def _shares(
-    looks: _Looks, planned: _Looks, scan: Scan, evidence: Evidence, template: Template,
-    options: SkippedOptions,
-) -> tuple[Values, Values, Mask]:  # fmt: skip
-    """(k,) how open each look is by surfaces, in halves of a line, by rays and surfaces both.
-
-    And whether rays alone say that all of it is. Where surfaces alone do not say that a line is
-    gone and rays say that it is open, each ray tells for itself: the nearest planes are those of
-    walls below, as wide as a line, or of the floor below one that hangs, and stand where they
-    should whether the line is there or not. What nobody looked into is there.
-    """
-    told_mm = evidence.clearance(looks.middle_mm, template.distance(looks.middle_mm))[0]
-    known = told_mm > SOLID_MM + 1e-6
-    told_mm, seen = told_mm[known], looks.some(known)
-    surface = np.clip(told_mm / seen.half_mm, -1.0, 1.0)
-    rays = np.clip(seen.rays_mm / seen.half_mm, -1.0, options.most_share)
-    topped = _topped(seen, evidence, options)
-    asked = np.flatnonzero(~topped & (surface < options.gone_share) & (seen.sunk_mm == 0))
-    went = _went_through(seen.some(asked), planned, scan, template, options)
-    told = asked[np.isfinite(went)]
-    surface[told] = rays[told] = went[np.isfinite(went)]
-    (by_surface, by_both), by_rays = np.full((2, len(known)), -1.0), np.zeros(len(known), bool)
-    by_rays[np.flatnonzero(known)[asked]] = went >= options.sure_by_both
-    by_surface[known] = surface
-    by_both[known] = np.where(topped, -1.0, 0.5 * (surface + rays))
-    return by_surface, by_both, by_rays
-
-
-def _went_through(
+def _by_views(
     looks: _Looks, planned: _Looks, scan: Scan, template: Template, options: SkippedOptions
-) -> Float[np.ndarray, " k"]:
-    """(k,) how open a line is by the mean of the rays that met its core, in halves of a line.
+) -> Values:
+    """(k,) how open a line is by all views, each once, in halves of a line.
 
-    From −1, where they ended on its top, to 1, on the floor, each as low as a line like it sags.
-    NaN where none came.
+    A scanner that errs does so view by view: one that sees a line gone is outvoted. What nobody
+    looked into is there, and a view that does not see it takes half of it to be.
     """
+    met, deep, came = _met(looks, scan, options)
     sag = _sag(looks, planned, scan, template, options)
-    met, deep = _met(looks, scan, options)
+    assert scan.sensor_index is not None
     open_by = np.clip(2.0 * (deep - sag[met]), -1.0, 1.0)
-    with np.errstate(invalid="ignore"):
-        return np.bincount(met, open_by, len(sag)) / np.bincount(met, minlength=len(sag))
+    return _each_view_once(open_by, met, scan.sensor_index[came], len(sag))
+
+
+def _each_view_once(
+    value: Values, met: Numbers, view: Int[np.ndarray, " n"], looks: int
+) -> Float[np.ndarray, " k"]:
+    """(k,) mean of the means of the views, of which so many see a look as of most; −1 of none."""
+    views = int(view.max(initial=0)) + 1
+    seen = np.bincount(met * views + view, minlength=looks * views).reshape(looks, views)
+    total = np.bincount(met * views + view, value, looks * views).reshape(looks, views)
+    count = (seen > 0).sum(axis=1)
+    usual = float(np.median(count[count > 0])) if len(met) else 1.0
+    mean = (total / np.maximum(seen, 1)).sum(axis=1) / np.maximum(count, usual)
+    return np.where(count > 0, mean, -1.0)
+
+
+def _enough_together(
+    paths: _Paths, planned: _Looks, scan: Scan, over_mm: float, options: SkippedOptions
+) -> int:
+    """So many looks that no stretch of the highest lines lies so much too high as one gone too low.
+
+    At least over a length; 0 where that is not to be had. A scanner's errors are both, and no line
+    that is gone lies too high.
+    """
+    if not over_mm:
+        return options.looks_together
+    if not np.isfinite(over_mm):
+        return 0
+    high_mm = planned.middle_mm[:, 2]
+    which = np.flatnonzero(high_mm > high_mm.max() - options.same_layer_mm)
+    met, deep, came = _met(planned.some(which), scan, options)
+    assert scan.sensor_index is not None
+    closed = np.clip(-2.0 * (deep + 1.0), -1.0, 1.0)
+    closes = _each_view_once(closed, met, scan.sensor_index[came], len(which))
+    together = int(np.ceil(max(over_mm, options.errs_along_mm) / options.look_step_mm))
+    while together * options.look_step_mm <= options.most_together_mm:
+        whole, part = (
+            _best_mean(closes, paths.path[which], count).max()
+            for count in (together, together // 2)
+        )
+        if whole < options.gone_share and part < options.sure_share:
+            return together
+        together *= 2
+    return 0
 
 
 def _sag(
@@ -559,7 +570,7 @@ def _sag(
     for high_mm, held_by in np.unique(np.column_stack([z_mm, held])[rim], axis=0):
         mine = np.flatnonzero((z_mm == high_mm) & (held == held_by))
         others = planned.some((other_mm == high_mm) & (alike == held_by))
-        met, deep = _met(others, scan, options)
+        met, deep, _ = _met(others, scan, options)
         order = np.lexsort((deep, met))
         which, first, count = np.unique(met[order], return_index=True, return_counts=True)
         if not len(which):
@@ -572,8 +583,8 @@ def _sag(
     return sag
 
 
-def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, Values]:
-    """(r,) looks whose lines' cores rays met, and how deep below the middle each ray ended.
+def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, Values, Numbers]:
+    """(r,) looks whose lines' cores rays met, how deep below the middle each ended, and which.
 
     In heights of a line. A ray counts where it crosses the height of the line's middle, however far
     aside the floor lies that it saw: between strands that hang apart slanting rays see all of what
@@ -582,12 +593,13 @@ def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, V
     core_mm = options.under_share * looks.width_mm
     reach_mm = float(np.hypot(core_mm.max(initial=0.0), 0.5 * options.look_step_mm))
     height_mm = np.round(looks.middle_mm[:, 2], 6)
-    found: list[tuple[Numbers, Values]] = [(np.zeros(0, np.int64), np.zeros(0))]
+    none = np.zeros(0, np.int64)
+    found: list[tuple[Numbers, Values, Numbers]] = [(none, np.zeros(0), none)]
     for z_mm in np.unique(height_mm):
         mine = np.flatnonzero(height_mm == z_mm)
         place_mm, thick_mm = looks.middle_mm[mine], 2.0 * looks.half_mm[mine]
         came, crossing_mm = rays_crossing(
-            scan, place_mm[:, :2], reach_mm, z_mm, z_mm + float(thick_mm.max())
+            scan, place_mm[:, :2], reach_mm, z_mm, z_mm + options.errs_over * float(thick_mm.max())
         )
         near = cKDTree(place_mm[:, :2]).query(crossing_mm, distance_upper_bound=reach_mm)[1]
         met = near < len(mine)
@@ -596,20 +608,10 @@ def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, V
         x, y = looks.along[mine[near]].T
         deep = (z_mm - points_mm[:, 2]) / thick_mm[near]
         in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[near]]
-        in_core &= deep >= -1.0
-        found.append((mine[near[in_core]], deep[in_core]))
-    which, depths = zip(*found, strict=True)
-    return np.concatenate(which), np.concatenate(depths)
-
-
-def _topped(looks: _Looks, evidence: Evidence, options: SkippedOptions) -> Mask:
-    """Looks at which something was seen at the line's own top: there it is, however rounded."""
-    half_mm = looks.half_mm[:, None]
-    top_mm = looks.middle_mm + half_mm * UP
-    distance, near = evidence.surfels.tree.nearest(top_mm, options.about)
-    low_mm = np.abs(top_mm[:, 2:] - evidence.surfels.place_mm[near, 2])
-    beside = distance < 0.5 * looks.width_mm[:, None]
-    return np.asarray((beside & (low_mm < options.top_share * half_mm)).any(axis=1))
+        in_core &= deep >= -options.errs_over
+        found.append((mine[near[in_core]], deep[in_core], came[met][in_core]))
+    which, depths, rays = (np.concatenate(each) for each in zip(*found, strict=True))
+    return which, depths, rays
 
 
 def _together(value: Values, path: Numbers, together: int) -> Values:

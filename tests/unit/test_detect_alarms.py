@@ -230,9 +230,9 @@ def test_noise_that_is_not_normal_says_so_itself(seed: int) -> None:
     points = sample_surface(plate.body, 0.3, seed=2)[0]
     white = np.random.default_rng(seed).normal(0.0, 0.03, points.shape)
     quiet = detect(Scan(points + white, 0.03, "template"), plate, calibration=NORMAL_NOISE)
-    assert (quiet.regions, quiet.calibration, quiet.chance_mm < 0.1) == ((), NORMAL_NOISE, True)
+    assert (quiet.regions, quiet.calibration, quiet.told_over_mm(0.1)) == ((), NORMAL_NOISE, 0.0)
     _, gradient = plate.distance_and_gradient(points)
     errors = wavering(points, 0.12, 2.0, seed)[:, None] * gradient
     loud = detect(Scan(points + white + errors, 0.03, "template"), plate, calibration=NORMAL_NOISE)
-    assert (loud.calibration, loud.chance_mm) == (None, np.inf)
+    assert (loud.calibration, loud.told_over_mm(0.1)) == (None, np.inf)
     assert len(loud.regions) <= 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import manifold3d as m3
 import numpy as np
 import pytest
@@ -65,7 +67,7 @@ def scan_of(solid: m3.Manifold, seed: int) -> Scan:
 def gone_lines(
     beads: PlannedBeads, scan: Scan, evidence: Evidence, template: Template
 ) -> PlannedBeads:
-    return skipped(beads, scan, evidence, template)[0]
+    return skipped(beads, scan, evidence, template)
 
 
 def scan_aslant(solid: m3.Manifold, seed: int) -> Scan:
@@ -255,37 +257,120 @@ def test_where_one_line_is_gone_a_shorter_stretch_of_another_is_told_too(seed: i
     assert ((middle[:, 0] > 17.0) & (np.abs(middle[:, 1] - 2.5 * WIDE_MM) < 1e-6)).any()
 
 
-@pytest.mark.parametrize(
-    ("row", "from_mm", "to_mm", "share"), [(2, 15.0, 18.0, -0.2), (0, 9.0, 16.0, -0.7)]
-)
-def test_rays_alone_do_not_tell_of_another_line_nor_of_more_of_the_same(
-    row: int, from_mm: float, to_mm: float, share: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("row", "from_mm", "to_mm"), [(2, 15.0, 18.0), (0, 9.0, 16.0)])
+def test_the_emptiest_ray_does_not_tell_of_another_line_nor_of_more_of_the_same(
+    row: int, from_mm: float, to_mm: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # regression: of thin walls of clean infill, beside one told gone, dozens were told gone, too,
     # by rays that ran past them where the surface said that they were there; and of a Benchy's
     # infill a line of 15 mm, of which a spot of 3 mm was
-    half_mm = 0.5 * HIGH_MM
-    rays_say, clearance = Evidence.rays_say, Evidence.clearance
+    rays_say = Evidence.rays_say
 
-    def past(points_mm: np.ndarray) -> np.ndarray:
+    def past(self: Evidence, points_mm: np.ndarray) -> np.ndarray:
         along = (points_mm[:, 0] > from_mm) & (points_mm[:, 0] < to_mm)
-        return along & (np.abs(points_mm[:, 1] - (row + 0.5) * WIDE_MM) < 0.2)
+        along &= np.abs(points_mm[:, 1] - (row + 0.5) * WIDE_MM) < 0.2
+        return np.where(along, 0.5 * HIGH_MM, rays_say(self, points_mm))
 
-    def rays(self: Evidence, points_mm: np.ndarray) -> np.ndarray:
-        return np.where(past(points_mm), half_mm, rays_say(self, points_mm))
-
-    def surface(self: Evidence, points_mm: np.ndarray, f_mm: np.ndarray) -> tuple[np.ndarray, ...]:
-        best, least = clearance(self, points_mm, f_mm)
-        return np.where(past(points_mm), share * half_mm, best), least
-
-    monkeypatch.setattr(Evidence, "rays_say", rays)
-    monkeypatch.setattr(Evidence, "clearance", surface)
-    monkeypatch.setattr(
-        "amrepair.regions.skipped._topped", lambda looks, *rest: looks.middle_mm[:, 0] < 0
-    )
+    monkeypatch.setattr(Evidence, "rays_say", past)
     found = gone_of(scan_of(without(4.0, 9.0, 0, 2 * HIGH_MM), 0))
     assert len(found.width_mm)
     assert (found.end_mm[:, 0] < 10.0).all()
+
+
+def erring(solid: m3.Manifold, seed: int, sigma_mm: float, over_mm: float) -> Scan:
+    """Seen from above and four sides, each view with errors that hang together over a length."""
+    scan, rng = scan_aslant(solid, seed), np.random.default_rng([seed, 9])
+    points_mm = scan.points_mm.copy()
+    for view in range(len(ASLANT)):
+        mine = scan.sensor_index == view
+        ways, phase = rng.normal(0.0, 1.0 / over_mm, (200, 2)), rng.uniform(0.0, 2 * np.pi, 200)
+        waves = np.cos(points_mm[mine, :2] @ ways.T + phase).sum(axis=1)
+        points_mm[mine, 2] += sigma_mm * np.sqrt(2.0 / 200.0) * waves
+    return Scan(points_mm, 0.05, "template", None, ASLANT.copy(), scan.sensor_index)
+
+
+LOWER = np.array([0.0, 0.0, HIGH_MM])
+
+
+def _rows(beads: PlannedBeads) -> tuple[np.ndarray, ...]:
+    return beads.start_mm, beads.end_mm, beads.width_mm, beads.height_mm
+
+
+def along_the_block() -> PlannedBeads:
+    """Every line of the block's last layer."""
+    y = np.arange(0.5 * WIDE_MM, 18.0, WIDE_MM)
+    start, end = (
+        np.column_stack([np.full(len(y), x), y, np.full(len(y), TOP_MM)]) for x in (0, 24)
+    )
+    return PlannedBeads(start, end, np.full(len(y), WIDE_MM), np.full(len(y), HIGH_MM))
+
+
+TWO_LINES = m3.Manifold.cube((12.0, 2 * WIDE_MM, 1.0)).translate(
+    (4.0, 10 * WIDE_MM, TOP_MM - HIGH_MM)
+)
+
+
+def told_mm(scan: Scan, over_mm: float) -> tuple[float, float]:
+    """Length of lines told gone where two are from 4 to 16 mm, and elsewhere."""
+    evidence = detect(scan, BLOCK, top_z_mm=TOP_MM).evidence
+    assert evidence is not None
+    found = skipped(along_the_block(), scan, evidence, BLOCK, over_mm=over_mm)
+    length_mm = np.linalg.norm(found.end_mm - found.start_mm, axis=1)
+    here = np.abs(found.start_mm[:, 1] - 11 * WIDE_MM) < WIDE_MM
+    here &= (found.start_mm[:, 0] > 2.0) & (found.end_mm[:, 0] < 18.0)
+    return float(length_mm[here].sum()), float(length_mm[~here].sum())
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_of_a_scanner_that_errs_lines_are_told_over_longer_stretches(seed: int) -> None:
+    # regression: with a real scanner's recorded noise no line was asked for at all, since places a
+    # millimetre wide seemed to lie lower than a line is high; of skipped lines a tenth were mended
+    sound, lacks = (erring(s, seed, 0.13, 2.0) for s in (BLOCK.body, BLOCK.body - TWO_LINES))
+    assert told_mm(sound, 0.0)[1] > 5.0  # as of a scanner that does not err
+    assert told_mm(sound, 5.0) == (0.0, 0.0)
+    here_mm, elsewhere_mm = told_mm(lacks, 5.0)
+    assert 12.0 < here_mm < 27.0
+    assert elsewhere_mm == 0.0
+
+
+@pytest.mark.parametrize("over_mm", [5.0, np.inf])
+def test_where_errors_reach_as_far_over_their_length_no_line_is_told(over_mm: float) -> None:
+    sigma_mm, length_mm = (0.13, 2.0) if np.isinf(over_mm) else (0.8, 8.0)
+    lacks = erring(BLOCK.body - TWO_LINES, 1, sigma_mm, length_mm)
+    assert sum(told_mm(lacks, 0.0)) > 5.0
+    assert told_mm(lacks, over_mm) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_lies_under_a_line_that_is_gone_is_told_through_it(seed: int) -> None:
+    # regression: of lines gone one above the other the lower ones were left: rays see less of them
+    deep = TWO_LINES.translate((0.0, 0.0, -0.55 * HIGH_MM))  # a little over half
+    block = along_the_block()
+    lower = replace(block, start_mm=block.start_mm - LOWER, end_mm=block.end_mm - LOWER)
+    beads = PlannedBeads(
+        *(np.concatenate(both) for both in zip(_rows(block), _rows(lower), strict=True))
+    )
+    for solid, layers in ((BLOCK.body - TWO_LINES, 1), (BLOCK.body - TWO_LINES - deep, 2)):
+        scan = erring(solid, seed, 0.1, 2.0)
+        evidence = detect(scan, BLOCK, top_z_mm=TOP_MM).evidence
+        assert evidence is not None
+        found = skipped(beads, scan, evidence, BLOCK, over_mm=5.0)
+        length_mm = np.linalg.norm(found.end_mm - found.start_mm, axis=1)
+        low_mm = length_mm[found.start_mm[:, 2] < TOP_MM - 0.5 * HIGH_MM].sum()
+        assert (low_mm > 3.0) == (layers == 2)
+
+
+def test_over_what_length_a_line_is_told_windows_say() -> None:
+    scan = scan_of(BLOCK.body, 0)
+    found = detect(scan, BLOCK, top_z_mm=TOP_MM)
+    assert found.told_over_mm(HIGH_MM) == 0.0
+    for chance_mm, over_mm in (
+        (((1.0, 0.1), (2.0, 0.0)), 0.0),
+        (((1.0, 0.6), (2.0, 0.0), (4.0, 0.0)), 2.0),
+        (((1.0, 0.6), (2.0, 0.1), (4.0, 0.3), (8.0, 0.0)), 8.0),
+        (((1.0, 0.6), (2.0, 0.6)), np.inf),
+    ):
+        assert replace(found, chance_mm=chance_mm).told_over_mm(HIGH_MM) == over_mm
 
 
 def gone_of(scan: Scan) -> PlannedBeads:
@@ -334,7 +419,7 @@ def test_a_stretch_goes_on_through_what_is_too_short_to_begin_one() -> None:
     assert len(paths.lines.width_mm) == 4  # the one alone is too short
     gone = np.where(paths.at_mm > 2.0, 0.2, -1.0)
     least_mm = np.full(len(paths.at_mm), USUAL_SKIPPED.least_stretch_mm)
-    kept = paths.kept(gone > 0, gone > 0, least_mm)
+    kept = paths.kept(gone > 0, least_mm)
     assert kept.any()
     assert (paths.at_mm[kept] < 5.0).all()
     grown = paths.grown(kept, gone, USUAL_SKIPPED)
@@ -572,5 +657,6 @@ def test_lines_over_a_rim_are_as_low_as_those_like_them(
     evidence = detect(scan, template, top_z_mm=top_mm).evidence
     assert evidence is not None
     found = gone_lines(beads, scan, evidence, template)
+    found = found.some(found.start_mm[:, 2] == top_mm)  # of what lies under it most went along
     told_mm = float(np.linalg.norm(found.end_mm - found.start_mm, axis=1).sum())
     assert told_mm == pytest.approx(gone_mm[1] - gone_mm[0], abs=1.0)
