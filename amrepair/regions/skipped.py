@@ -121,7 +121,8 @@ def skipped(
     opens[ask] = _by_views(looks, planned, scan, template, options)
     less = max(together // 2, options.looks_together)  # over which it must be the surer
     whole, part = (_together(opens, paths.path, count) for count in (together, less))
-    gone = (whole >= options.gone_share) | (part >= options.sure_share)
+    share = options.gone_erring if over_mm else options.gone_share
+    gone = (whole >= share) | (part >= options.sure_share)
     kept = paths.kept(gone, np.full(len(line), options.least_stretch_mm))
     found = paths.stretches(kept)
     if not len(found.width_mm):
@@ -545,7 +546,7 @@ def _enough_together(
             _best_mean(closes, paths.path[which], count).max()
             for count in (together, together // 2)
         )
-        if whole < options.gone_share and part < options.sure_share:
+        if whole < options.gone_erring and part < options.sure_share:
             return together
         together *= 2
     return 0
