@@ -118,55 +118,20 @@ def begun_inside(run: Bead, model: PatchModel) -> Bead:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pieces:
-    """The pieces of some runs, from point to point.
-
-    Attributes
-    ----------
-    middle_mm, length_mm
-        (m, 2) and (m,).
-    half_mm
-        (m,) half of the strip that each stands for.
-    """
-
-    middle_mm: Float[np.ndarray, "m 2"]
-    length_mm: Float[np.ndarray, " m"]
-    half_mm: Float[np.ndarray, " m"]
-
-    @classmethod
-    def of(cls, runs: list[Bead]) -> _Pieces:
-        """Of all runs, one after the other."""
-        middle = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
-        length = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
-        return cls(middle, length, 0.5 * np.concatenate([run.share_mm for run in runs]))
-
-    def nearest(
-        self, points_mm: Float[np.ndarray, "n 2"]
-    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """How far the piece is that each point belongs to, and which it is.
-
-        By the power of a point, d² − r² of a piece r wide to each side: of two strips side by side
-        each gets its own, however much wider one is. It is the nearest in a space of one dimension
-        more, where pieces lie as high as √(R² − r²) (F. Aurenhammer, "Power diagrams", SIAM J.
-        Comput. 16, 1987).
-        """
-        high = np.sqrt(np.maximum(self.half_mm.max() ** 2 - self.half_mm**2, 0.0))
-        tree = cKDTree(np.column_stack([self.middle_mm, high]))
-        _, piece = tree.query(np.column_stack([points_mm, np.zeros(len(points_mm))]))
-        return np.hypot(*(points_mm - self.middle_mm[piece]).T), piece
-
-
-@dataclass(frozen=True, slots=True)
 class _Shares:
     """Which columns go to which piece of some runs.
 
     Attributes
     ----------
+    middle_mm, length_mm
+        (m, 2) and (m,) of the pieces; `tree` finds the nearest.
     columns, piece, thick_mm
         (c,) the columns that beads get to, the piece that each goes to, what each wants.
     """
 
-    pieces: _Pieces
+    middle_mm: Float[np.ndarray, "m 2"]
+    length_mm: Float[np.ndarray, " m"]
+    tree: cKDTree
     columns: Int[np.ndarray, " c"]
     piece: Int[np.ndarray, " c"]
     thick_mm: Float[np.ndarray, " c"]
@@ -180,27 +145,26 @@ class _Shares:
         model: PatchModel,
     ) -> _Shares:
         """To the nearest piece, as far as a bead spreads, and in `strips` on to the wall."""
-        pieces = _Pieces.of(runs)
+        middle = np.concatenate([0.5 * (run.xy_mm[1:] + run.xy_mm[:-1]) for run in runs])
+        length = np.concatenate([np.hypot(*np.diff(run.xy_mm, axis=0).T) for run in runs])
         filled = np.flatnonzero(thick.ravel() > 0)
-        distance, nearest = pieces.nearest(model.points_mm[filled])
-        within_mm = np.where(
-            strips.ravel()[filled],
-            model.spread_mm + model.options.beads.to_wall_mm,
-            model.spread_mm,
+        tree = cKDTree(middle)
+        distance, nearest = tree.query(
+            model.points_mm[filled],
+            distance_upper_bound=model.spread_mm + model.options.beads.to_wall_mm,
         )
-        near = distance < within_mm
+        near = np.isfinite(distance) & ((distance < model.spread_mm) | strips.ravel()[filled])
         columns = filled[near]
-        return cls(pieces, columns, nearest[near], thick.ravel()[columns])
+        return cls(middle, length, tree, columns, nearest[near], thick.ravel()[columns])
 
     def sums(self, of_column: Float[np.ndarray, " c"]) -> Float[np.ndarray, " m"]:
         """By piece; of nothing `bincount` makes integers."""
-        pieces = len(self.pieces.length_mm)
-        return np.bincount(self.piece, of_column, minlength=pieces).astype(np.float64)
+        return np.bincount(self.piece, of_column, minlength=self.tree.n).astype(np.float64)
 
     @property
     def deep_mm(self) -> Float[np.ndarray, " m"]:
         """What the columns of each piece want on average."""
-        number = np.bincount(self.piece, minlength=len(self.pieces.length_mm))
+        number = np.bincount(self.piece, minlength=self.tree.n)
         return self.sums(self.thick_mm) / np.maximum(number, 1)
 
 
@@ -232,8 +196,8 @@ def weighed(
             told_mm3,
             depth,
             job,
-            shares.pieces.length_mm,
-            shares.pieces.middle_mm,
+            shares.length_mm,
+            shares.middle_mm,
             setup.process.line_width_mm,
             options.lines,
         )
@@ -245,7 +209,7 @@ def weighed(
         mine = slice(at, at + len(run.xy_mm) - 1)
         at = mine.stop
         section = options.beads.bond_ratio * _smooth(
-            volume[mine], shares.pieces.length_mm[mine], closed=run.closed
+            volume[mine], shares.length_mm[mine], closed=run.closed
         )
         deep = np.maximum(depth[mine], options.beads.least_thick_mm)
         most = _most_section(deep, options.beads.bond_ratio * own[mine], setup, model.options.fill)
@@ -284,10 +248,10 @@ def _by_lines(
     """
     lines_mm, within_mm = [run.xy_mm for run in runs], job.half_mm + model.options.beads.on_line_mm
     under = np.flatnonzero(job.over & beside_runs(lines_mm, within_mm, model))
-    _, of_piece = shares.pieces.nearest(model.points_mm[under])
-    number = np.bincount(of_piece, minlength=len(shares.pieces.length_mm))
-    deep = np.bincount(of_piece, thick.ravel()[under], minlength=len(shares.pieces.length_mm))
-    own = job.section_mm2 * shares.pieces.length_mm * deep / np.maximum(number, 1) / job.height_mm
+    of_piece = shares.tree.query(model.points_mm[under])[1]
+    number = np.bincount(of_piece, minlength=shares.tree.n)
+    deep = np.bincount(of_piece, thick.ravel()[under], minlength=shares.tree.n)
+    own = job.section_mm2 * shares.length_mm * deep / np.maximum(number, 1) / job.height_mm
     beside = ~np.isin(shares.columns, under)
     extra = shares.sums(np.where(beside, shares.thick_mm, 0.0)) * model.cell_mm**2 * model.weight
     whole_mm3 = float((own + extra).sum())

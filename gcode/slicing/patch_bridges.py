@@ -327,7 +327,7 @@ def _held_on(
         if (last - first + 1) * step_mm > model.longest_span_mm:
             continue
         xy = start_mm + np.array([[first - hold], [last + hold]]) * step_mm * along
-        bead = Bead(xy, np.array([found.spacing_mm]), Role.BRIDGE, closed=False)
+        bead = Bead(xy, np.ones(1), Role.BRIDGE, closed=False)
         runs = free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
         if len(runs) == 1 and runs[0].length_mm > bead.length_mm - 1e-6:
             found.beads.append(runs[0])

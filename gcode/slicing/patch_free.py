@@ -112,7 +112,7 @@ def free_runs(
     return [
         Bead(
             points[a : b + 1],
-            bead.share_mm[owner[a:b]],
+            np.ones(b - a),
             bead.role,
             closed=bool(bead.closed and b - a == len(owner)),
         )

@@ -545,25 +545,3 @@ def test_no_more_plastic_is_laid_than_the_columns_ask_for() -> None:
     assert plan.beads_mm3 == pytest.approx(
         USUAL_PATCH.beads.bond_ratio * plan.reachable_mm3, rel=0.02
     )
-
-
-def test_each_bead_of_a_wall_gets_its_own_strip_of_it() -> None:
-    """A wall's rims had also a part of the wider bead between them: 0.50 mm for strips of 0.41.
-
-    So they spilt over the wall's faces, and the bead between them left gaps.
-    """
-    low_mm, high_mm = 60.0, 61.5
-    wall = m3.Manifold.cube((30.0, high_mm - low_mm, TOP_MM)).translate((60.0, low_mm, 0.0))
-    missing = m3.Manifold.cube((10.0, 5.0, 0.6)).translate((70.0, 58.0, TOP_MM - 0.6)) ^ wall
-    plan, _ = plan_of(missing, wall)
-    rims = 0
-    for move in plan.toolpath:
-        if not isinstance(move, Extrude) or move.role is not Role.PERIMETER:
-            continue
-        middle = 0.5 * (move.points_mm[1:] + move.points_mm[:-1])
-        away_mm = np.minimum(middle[:, 1] - low_mm, high_mm - middle[:, 1])
-        along = (np.abs(middle[:, 0] - 75.0) < 3.0) & (away_mm < 0.3)
-        strip_mm = np.asarray(move.section_mm2)[along] / 0.2
-        assert strip_mm == pytest.approx(2.0 * away_mm[along], rel=0.08)
-        rims += int(along.sum())
-    assert rims
