@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.align.clutter import noise_across, without_clutter
+from amrepair.align.clutter import Kept, noise_across, without_clutter
 from amrepair.align.coarse import by_features, cube_rotations
 from amrepair.align.families import best_turns, slides
 from amrepair.align.options import AlignOptions, Effort
@@ -82,6 +82,8 @@ class _Hunt:
 
     Attributes
     ----------
+    kept
+        What is taken for the part: all of the scan, or what is left of it without clutter.
     found
         Best first.
     twinned
@@ -92,12 +94,10 @@ class _Hunt:
     template: Template
     field: CoarseField
     clouds: Clouds
-    part_mm: Points
+    kept: Kept
     sigma_mm: float
     inlier_mm: float
     found: list[Scored] = dataclasses.field(default_factory=list)
-    left_out_ratio: float = 0.0
-    is_piece: bool = False
     twinned: list[Matrix] = dataclasses.field(default_factory=list)
 
     @property
@@ -153,7 +153,7 @@ def pose_from_anywhere(
     sigma_mm, inlier_mm = told.limits_mm(sigma_mm, template.bias_mm)
     clouds = Clouds.of(points_mm, template, sigma_mm, options.poses, rng)
     field = CoarseField.of(template, coarse)
-    hunt = _Hunt(options, template, field, clouds, points_mm, sigma_mm, inlier_mm)
+    hunt = _Hunt(options, template, field, clouds, Kept(points_mm, 0.0), sigma_mm, inlier_mm)
     progress("align", 0.1, 1.0)
     hunt.take(_worth_refining(clouds, field, coarse.quick))
     if hunt.share < told.doubtful and not noise_is_measured:
@@ -189,7 +189,7 @@ def pose_from_anywhere(
     if hunt.share < least_ratio:
         progress("align", 0.6, 1.0)
         _ask_features(hunt)
-    if hunt.left_out_ratio > 0.0:
+    if hunt.kept.left_out_ratio > 0.0:
         _ask_the_whole(hunt, clouds, of_all, points_mm, least_ratio)
     progress("align", 0.8, 1.0)
     if hunt.share > told.explained:
@@ -221,20 +221,20 @@ def _ask_the_whole(
     off_mm = hunt.template.distance(moved(clouds.dense_mm, without))
     clearer = float((np.abs(off_mm) <= hunt.inlier_mm).mean()) + told.clearer_by
     if share > told.cleared or share > max(least_ratio, clearer):
-        hunt.clouds, hunt.found, hunt.left_out_ratio, hunt.part_mm = clouds, whole, 0.0, points_mm
-        hunt.is_piece = False
+        hunt.clouds, hunt.found, hunt.kept = clouds, whole, Kept(points_mm, 0.0)
 
 
 def _answer(hunt: _Hunt, rng: np.random.Generator) -> Found:
     """What was found, with the share of the points that it explains."""
-    best, others = _best_and_others(hunt)
+    (best, others), kept = _best_and_others(hunt), hunt.kept
     # The thinned cloud will not do: few scattered points fill as many voxels as many on a surface.
-    sample = hunt.part_mm[rng.permutation(len(hunt.part_mm))[: hunt.options.poses.dense_points]]
+    some = rng.permutation(len(kept.points_mm))[: hunt.options.poses.dense_points]
+    sample = kept.points_mm[some]
     residual = hunt.template.distance(moved(sample, best.matrix))
     ratio = float((np.abs(residual) <= hunt.inlier_mm).mean())
     return Found(
-        best, others, ratio, hunt.part_mm, hunt.left_out_ratio, hunt.sigma_mm, hunt.inlier_mm,
-        float((residual > hunt.inlier_mm).mean()), hunt.is_piece, hunt.field,
+        best, others, ratio, kept.points_mm, kept.left_out_ratio, hunt.sigma_mm, hunt.inlier_mm,
+        float((residual > hunt.inlier_mm).mean()), kept.is_piece, hunt.field,
     )  # fmt: skip
 
 
@@ -247,8 +247,7 @@ def _leave_clutter(hunt: _Hunt, points_mm: Points, rng: np.random.Generator) -> 
         starts = starts[: options.explained.few_tried]
         again = refined(starts, fewer, hunt.template)
         if explained(again[0][1], hunt.inlier_mm) > hunt.share:
-            hunt.clouds, hunt.found, hunt.part_mm = fewer, again, kept.points_mm
-            hunt.left_out_ratio, hunt.is_piece = kept.left_out_ratio, kept.is_piece
+            hunt.clouds, hunt.found, hunt.kept = fewer, again, kept
         if hunt.share > options.explained.cleared:
             break
 

@@ -28,11 +28,11 @@ class SkippedOptions:
         that meet its core: −1 on its top, 1 on its floor. Half of its plastic is 0, and pixels
         beside a silhouette let rays run past a wall. And over half of such a stretch, which must be
         the surer.
+    gone_erring
+        The first of the two where the scanner errs: of 114 sound looks, most at parts never tuned
+        on, two told lines at 0.5 to 0.6, none at more.
     least_again_mm, same_layer_mm
         In a layer of which a stretch is gone others may be shorter.
-    gone_erring
-        The first of them where the scanner errs: of 114 sound looks, most at parts never tuned on,
-        two told lines at 0.5 to 0.6, none at more.
     errs_over, errs_along_mm, most_together_mm
         Rays that end so many heights over a line's middle are errors that count. Where a scanner
         errs a line is judged over so much at least, as recorded errors that lie far off are no

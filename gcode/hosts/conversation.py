@@ -258,7 +258,7 @@ class SerialConversation:
 
     def temperatures(self) -> Temperatures:
         """Ask for temperatures (M105)."""
-        report = self._agreed("M105", lambda: self._temperatures, "temperatures", _alike)
+        report = self._heaters()
         hotend, bed = report.hotend, report.heaters.get("B")
         if hotend is None:
             raise LinkError("The printer reports no hotend temperature; check its firmware.")
@@ -298,8 +298,10 @@ class SerialConversation:
 
     def _targets_c(self) -> dict[str, float | None]:
         """What the heaters aim at, by the names that the printer gives them."""
-        report = self._agreed("M105", lambda: self._temperatures, "temperatures", _alike)
-        return {name: heater.target_c for name, heater in report.heaters.items()}
+        return {name: heater.target_c for name, heater in self._heaters().heaters.items()}
+
+    def _heaters(self) -> ev.TemperatureReport:
+        return self._agreed("M105", lambda: self._temperatures, "temperatures", _alike)
 
     def _agreed(
         self,
