@@ -47,6 +47,8 @@ class Scale:
         (s,) median, `RANK`-th lowest and `RANK`-th highest value of each window.
     noise_mm
         (s,) standard deviation of the cells' values about their neighbours', as seen around.
+    apart
+        (s,) windows that hold none of the other cells.
     """
 
     cell_mm: float
@@ -62,6 +64,7 @@ class Scale:
     high_mm: Values
     noise_mm: Values
     window_weight: Values
+    apart: Mask
 
     def __len__(self) -> int:
         return len(self.value_mm)
@@ -94,6 +97,7 @@ def scales_of(
     *,
     cell_mm: float,
     widest_mm: float,
+    apart: Mask | None = None,
 ) -> tuple[Scale, ...]:
     """The field at cells of `cell_mm` and wider, up to windows of `widest_mm` across.
 
@@ -106,10 +110,13 @@ def scales_of(
         of observations.
     widest_mm
         No window is wider than this, but for the first scale's.
+    apart
+        Cells that share no window with the others; None: there are none.
     """
     found: list[Scale] = []
     of_base = np.arange(len(place_mm))
-    inner = (place_mm, normal, value_mm, weight.astype(np.float64))
+    alone = np.zeros(len(place_mm), bool) if apart is None else apart
+    inner = (place_mm, normal, value_mm, weight.astype(np.float64), alone)
     size_mm = cell_mm
     while True:
         scale = _scale(of_base, *inner, size_mm, medians=bool(found))
@@ -117,11 +124,12 @@ def scales_of(
         if 2.0 * 3.0 * size_mm > widest_mm or len(scale) <= kernels.MOST_NEIGHBOURS:
             return tuple(found)
         of_base = scale.of_base
-        inner = (scale.place_mm, scale.normal, scale.value_mm, scale.weight)
+        inner = (scale.place_mm, scale.normal, scale.value_mm, scale.weight, scale.apart)
         if len(found) == 1:
             stray = ~scale.is_surface
             normal = np.where(stray[:, None], 0.0, scale.normal)
-            inner = (scale.place_mm, normal, scale.value_mm, np.where(stray, NOTHING, scale.weight))
+            weight = np.where(stray, NOTHING, scale.weight)
+            inner = (scale.place_mm, normal, scale.value_mm, weight, scale.apart)
         size_mm *= 2.0
 
 
@@ -131,12 +139,13 @@ def _scale(
     normal: Points,
     value_mm: Values,
     weight: Values,
+    apart: Mask,
     cell_mm: float,
     *,
     medians: bool,
 ) -> Scale:
     """Group the cells of the scale below, and look at each group's window."""
-    order, start, keys, strides = _grouped(place_mm, normal, cell_mm)
+    order, start, keys, strides = _grouped(place_mm, normal, apart, cell_mm)
     group = np.empty(len(order), np.int64)
     group[order] = np.repeat(np.arange(len(start) - 1), np.diff(start))
     first = start[:-1]
@@ -169,6 +178,7 @@ def _scale(
         high_mm=high,
         noise_mm=noise,
         window_weight=around,
+        apart=keys % kernels.SLOTS == kernels.APART,
     )
 
 
@@ -180,13 +190,14 @@ def ways_of(normal: Points) -> Numbers:
 
 
 def _grouped(
-    place_mm: Points, normal: Points, cell_mm: float
+    place_mm: Points, normal: Points, apart: Mask, cell_mm: float
 ) -> tuple[Numbers, Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
     """Order of the cells by the wider cell that holds them, where each begins, keys, strides."""
     index = cells_of(place_mm, place_mm.min(axis=0), cell_mm) + 1
     shape = index.max(axis=0) + 2
     strides = (int(shape[1] * shape[2]), int(shape[2]))
-    key = (index @ np.array([*strides, 1])) * kernels.SLOTS + ways_of(normal)
+    way = np.where(apart, kernels.APART, ways_of(normal))
+    key = (index @ np.array([*strides, 1])) * kernels.SLOTS + way
     order = np.argsort(key, kind="stable")
     ranked = key[order]
     begins = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])

@@ -11,8 +11,10 @@ from gcode.compiled import njit, prange
 MOST_NEIGHBOURS = 64
 # Cells by one thread, one after the other: their neighbours lie one after the other, too.
 TOGETHER = 256
-# Slots for the way a cell faces (±x, ±y, ±z), in its key; a power of two.
+# Slots for the way a cell faces (±x, ±y, ±z, nowhere), in its key; a power of two. The last is of
+# cells that are looked at apart from the others.
 SLOTS = 8
+APART = SLOTS - 1
 # median |x| of a normal value of standard deviation 1 (scipy.stats.norm.ppf(0.75))
 NORMAL_MEDIAN = 0.674490
 # median |a − b| of two normal values of standard deviation 1
@@ -70,8 +72,9 @@ def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
                     j += 1
                 begins[line] = j
                 while j < n and keys[j] < first + 3 * SLOTS:
+                    together = (keys[i] % SLOTS == APART) == (keys[j] % SLOTS == APART)
                     if found < MOST_NEIGHBOURS and (
-                        j == i or _alike(normal, value, i, j, cosine, aside)
+                        j == i or (together and _alike(normal, value, i, j, cosine, aside))
                     ):
                         table[i, found] = j
                         found += 1

@@ -139,7 +139,7 @@ def _tested(
     seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
 ) -> Tested:
     """Test every scale, and grow regions from where it is significant."""
-    cells, crossed = slice(len(seen.surfels)), slice(len(seen.surfels), None)
+    cells, gone_to = len(seen.surfels), len(seen.surfels) + len(seen.crossed.which)
     levels = tested(sites, options, calibration)
     if calibration == NORMAL_NOISE and _erratic(levels, options):  # the scan itself contradicts
         levels, calibration = tested(sites, options, None), None
@@ -153,17 +153,21 @@ def _tested(
         levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
     )
     gone = np.zeros(len(seen.surface_mm), bool)
-    gone[seen.crossed.which] = labels[0, crossed]
+    gone[seen.crossed.which] = labels[0, cells:gone_to]
     gone_p_value = np.ones(len(seen.surface_mm))
-    gone_p_value[seen.crossed.which] = np.exp(log_p[0, crossed])
+    gone_p_value[seen.crossed.which] = np.exp(log_p[0, cells:gone_to])
+    # an end speaks for the cell that its points are part of
+    ended = seen.ends.surfel[labels[0, gone_to:]]
+    labels[0, ended], labels[1, ended] = True, False
+    np.minimum.at(log_p[0], seen.ends.surfel, log_p[0, gone_to:])
     errors = as_student(levels[1].quantile, levels[1].freedom)
     noise_mm = float(np.median(errors * levels[1].error_mm))
     return Tested(
         levels,
         calibration,
         noise=noise_of(levels, seen.shares, seen.scan.sigma_mm, options),
-        missing=labels[0, cells],
-        excess=labels[1, cells],
+        missing=labels[0, :cells],
+        excess=labels[1, :cells],
         gone=gone,
         gone_p_value=gone_p_value,
         log_p=log_p,

@@ -102,6 +102,22 @@ USUAL_SKIPPED = SkippedOptions()
 
 
 @dataclass(frozen=True, slots=True)
+class WallEndOptions:
+    """Broken ends of thin walls, where no rays tell that the wall is gone.
+
+    Attributes
+    ----------
+    stray_sigmas
+        So much of a point's noise below the surface noise alone leaves one point in 700.
+    thin_depths
+        A wall no thicker than so many times a point's depth: the point lies in its middle half.
+    """
+
+    stray_sigmas: float = 3.0
+    thin_depths: float = 4.0
+
+
+@dataclass(frozen=True, slots=True)
 class RegionOptions:
     """Settings of the test for regions; a result records those it was made with.
 
@@ -162,9 +178,9 @@ class RegionOptions:
     guess_depths
         Behind surface that stands, as thick as a part may be there, a place is nobody's knowledge
         where a template's guess lies within so many times its depth.
-    background, surfels, evidence
-        What is not the part, how the scan is condensed, and how space around broken surface is
-        known.
+    wall_ends, background, surfels, evidence
+        Where thin walls broke off, what is not the part, how the scan is condensed, and how space
+        around broken surface is known.
     top_k
         How many of the highest scores make the object score (PASDF: 1000).
     """
@@ -190,6 +206,7 @@ class RegionOptions:
     bed_windows: int = 1000
     spacing_mm: float = 0.6
     guess_depths: float = 2.0
+    wall_ends: WallEndOptions = field(default_factory=WallEndOptions)
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
     surfels: SurfelOptions = field(default_factory=SurfelOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)

@@ -237,6 +237,7 @@ def tested(
         sites.weight,
         cell_mm=sites.cell_mm,
         widest_mm=options.widest_mm,
+        apart=sites.apart,
     )
     share = options.false_regions / (2 * (len(scales) + 1))
     levels = []

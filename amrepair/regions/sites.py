@@ -24,6 +24,7 @@ from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
 from amrepair.observe.views import Contradiction, Shares, contradictions
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.wall_ends import NO_ENDS, Surface, WallEnds, wall_ends
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
 from amrepair.template.learned import TOLERATED_SPREADS
@@ -44,15 +45,16 @@ STILL_NEAREST = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Sites:
-    """Where the test looks: cells of the field, and template surface that rays saw through.
+    """Where the test looks: cells of the field, template surface that rays saw through, and ends
+    of thin walls.
 
     Attributes
     ----------
     cells, cell_mm
         How many of them are cells, and the edge of one.
     place_mm, normal, value_mm, weight
-        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points; places are drawn to
-        the template's surface by up to half a cell.
+        (b, 3), (b, 3), (b,), (b,): the cells first, then the template's points, then the ends;
+        places of cells are drawn to the template's surface by up to half a cell.
     tolerance_mm
         (2, b) δ for missing and for excess.
     facing
@@ -61,6 +63,8 @@ class Sites:
         (b,) standard error of the value that neighbours share: by what is left open of the pose,
         the size and the bow, by what views say differently, and by where in their pixels rays
         passed.
+    ends
+        How many of them, the last, are ends.
     """
 
     cells: int
@@ -72,6 +76,12 @@ class Sites:
     tolerance_mm: Float[np.ndarray, "2 b"]
     facing: Values
     pose_mm: Values
+    ends: int = 0
+
+    @property
+    def apart(self) -> Mask:
+        """(b,) those that are no neighbours of the others: ends of walls."""
+        return np.arange(len(self.value_mm)) >= len(self.value_mm) - self.ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +104,8 @@ class Observed:
         (m,) the surfel that lies on each place of it, −1 where none does.
     crossed
         Places with none that rays passed.
+    ends
+        Where thin walls end inside the template; none where rays tell what is gone.
     shares
         What each view says; None where views are not known.
     """
@@ -109,6 +121,7 @@ class Observed:
     normals: Float[np.ndarray, "m 3"]
     nearest: Int[np.ndarray, " m"]
     crossed: Passed
+    ends: WallEnds
     shares: Shares | None
 
 
@@ -154,6 +167,12 @@ def observed(
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
     crossed = _crossed(seen, surfels, outward, surface_mm, normals)
+    ends = NO_ENDS
+    if not seen:
+        sigma_mm = max(scan.sigma_mm, surfels.spread_mm)
+        present_mm, planes = PRESENT_CELLS * surfels.cell_mm, options.evidence.faces.plane_points
+        on = Surface(surface_mm, normals, nearest >= 0, present_mm)
+        ends = wall_ends(scan.points_mm, sigma_mm, template, surfels, on, planes, options.wall_ends)
     shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
     return Observed(
         scan,
@@ -167,6 +186,7 @@ def observed(
         normals,
         nearest,
         crossed,
+        ends,
         shares,
     )
 
@@ -199,15 +219,14 @@ def sites_of(
     half_mm = 0.5 * surfels.cell_mm
     aside_mm = np.clip(surfels.deviation_mm, -half_mm, half_mm)
     feet_mm = surfels.place_mm - aside_mm[:, None] * outward
-    crossed = seen.crossed
+    crossed, ends = seen.crossed, seen.ends
     crossed_mm = seen.surface_mm[crossed.which]
     deep_mm = _at_most_through(template, crossed_mm, seen.normals[crossed.which], crossed.depth_mm)
-    value_mm = np.concatenate([surfels.deviation_mm, -deep_mm])
-    # what rays passed has no points of its own: it was seen as most places were
+    value_mm = np.concatenate([surfels.deviation_mm, -deep_mm, -ends.depth_mm])
+    # what rays passed has no points of its own: it was seen as most places were, as were ends
     facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels))))
-    typical, faced = (
-        np.full(len(crossed_mm), float(np.median(told))) for told in (surfels.count, facing)
-    )
+    usual_count, usual_facing = (float(np.median(told)) for told in (surfels.count, facing))
+    others = len(crossed_mm) + len(ends)
     anywhere_mm, top_mm = tolerances(options, template)
     tolerance_mm = np.full((2, len(value_mm)), anywhere_mm)
     if top_z_mm is not None:
@@ -215,7 +234,7 @@ def sites_of(
         top = np.abs(surfels.deviation_mm - under) < ON_PLANE_MM
         tolerance_mm[0, : len(surfels)][top] = top_mm
     spread = getattr(template, "spread_mm", None)
-    place_mm = np.concatenate([surfels.place_mm, crossed_mm])
+    place_mm = np.concatenate([surfels.place_mm, crossed_mm, ends.place_mm])
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
     unknown = _behind_what_stands(seen, anywhere_mm, options)
@@ -226,13 +245,14 @@ def sites_of(
     return Sites(
         cells=len(surfels),
         cell_mm=surfels.cell_mm,
-        place_mm=np.concatenate([feet_mm, crossed_mm]),
-        normal=np.concatenate([outward, seen.normals[crossed.which]]),
+        place_mm=np.concatenate([feet_mm, crossed_mm, ends.place_mm]),
+        normal=np.concatenate([outward, seen.normals[crossed.which], ends.normal]),
         value_mm=value_mm,
-        weight=np.concatenate([surfels.count, typical]),
+        weight=np.concatenate([surfels.count, np.full(len(crossed_mm), usual_count), ends.count]),
         tolerance_mm=tolerance_mm,
-        facing=np.concatenate([facing, faced]),
-        pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm]),
+        facing=np.append(facing, np.full(others, usual_facing)),
+        pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm, np.zeros(len(ends))]),
+        ends=len(ends),
     )
 
 
