@@ -24,7 +24,7 @@ from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
 from amrepair.observe.views import Contradiction, Shares, contradictions
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.wall_ends import NO_ENDS, Surface, WallEnds, wall_ends
+from amrepair.regions.wall_ends import NO_ENDS, ShownSurface, WallEnds, wall_ends
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
 from amrepair.template.learned import TOLERATED_SPREADS
@@ -167,28 +167,15 @@ def observed(
     nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
     crossed = _crossed(seen, surfels, outward, surface_mm, normals)
-    ends = NO_ENDS
-    if not seen:
-        sigma_mm = max(scan.sigma_mm, surfels.spread_mm)
-        present_mm, planes = PRESENT_CELLS * surfels.cell_mm, options.evidence.faces.plane_points
-        on = Surface(surface_mm, normals, nearest >= 0, present_mm)
-        ends = wall_ends(scan.points_mm, sigma_mm, template, surfels, on, planes, options.wall_ends)
+    present_mm, planes = PRESENT_CELLS * surfels.cell_mm, options.evidence.faces.plane_points
+    on = ShownSurface(surface_mm, normals, nearest >= 0, present_mm)
+    # where rays are known they tell what of a wall is gone
+    ends = NO_ENDS if seen else wall_ends(scan, template, surfels, on, planes, options.wall_ends)
     shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
     return Observed(
-        scan,
-        template,
-        f_mm,
-        keep,
-        surfels,
-        outward,
-        seen,
-        surface_mm,
-        normals,
-        nearest,
-        crossed,
-        ends,
-        shares,
-    )
+        scan, template, f_mm, keep, surfels, outward, seen, surface_mm, normals, nearest, crossed,
+        ends, shares,
+    )  # fmt: skip
 
 
 def _crossed(

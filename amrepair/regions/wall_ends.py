@@ -21,6 +21,7 @@ from amrepair.field.fused import Surfels
 from amrepair.field.places import PlaceTree
 from amrepair.field.scales import WINDOW_FACING
 from amrepair.regions.options import WallEndOptions
+from amrepair.scans import Scan
 from amrepair.template.port import Template
 
 # Steps along a ray from inside the part to where it leaves it; each as long as the distance there.
@@ -28,7 +29,7 @@ MOST_STEPS = 16
 
 
 @dataclass(frozen=True)
-class Surface:
+class ShownSurface:
     """Places evenly spread on the template's surface.
 
     Attributes
@@ -85,11 +86,10 @@ NO_ENDS = WallEnds(*2 * (np.empty((0, 3)),), *2 * (np.empty(0),), np.empty(0, np
 
 
 def wall_ends(
-    points_mm: Float[np.ndarray, "p 3"],
-    sigma_mm: float,
+    scan: Scan,
     template: Template,
     surfels: Surfels,
-    surface: Surface,
+    surface: ShownSurface,
     plane_points: int,
     options: WallEndOptions,
 ) -> WallEnds:
@@ -97,13 +97,14 @@ def wall_ends(
 
     Parameters
     ----------
-    points_mm, sigma_mm
-        (p, 3) of the scan, template frame, and the noise of one.
+    scan, surfels
+        In the template's frame.
     surface
         The template's, and what of it the scan shows.
     plane_points
         So many neighbours tell the plane at a point.
     """
+    points_mm, sigma_mm = scan.points_mm, max(scan.sigma_mm, surfels.spread_mm)
     inside = surfels.of_point >= 0
     inside &= surfels.point_deviation_mm < -options.stray_sigmas * sigma_mm
     which = np.flatnonzero(inside)
@@ -130,7 +131,7 @@ def wall_ends(
 
 
 def _goes_no_further(
-    surface: Surface, points_mm: Points, to_face_mm: Points, plane: Points
+    surface: ShownSurface, points_mm: Points, to_face_mm: Points, plane: Points
 ) -> Bool[np.ndarray, " n"]:
     """(n,) whether on one side of a plane across a wall neither of the wall's faces was seen."""
     beyond_mm = 2.0 * surface.present_mm * plane  # what lies at the end itself is not there
