@@ -7,6 +7,7 @@ Kobbelt 2006; Labatut, Pons & Keriven 2009). It needs neither rays nor normals.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -626,8 +627,14 @@ def _guessed(
     nearest = ndimage.distance_transform_edt(
         ~ends[box], return_distances=False, return_indices=True
     )
+    # a gap in what was scanned of an end, no wider than points are asked for, is chance
+    across = 2 * math.ceil(width_mm / grid.voxel_mm) + 1
+    known, every = (
+        ndimage.uniform_filter(one[box].astype(np.float32), across, mode="constant")
+        for one in (np.logical_or.reduce([*scanned.values()]), ends)
+    )
     guessed = void.copy()
-    guessed[box] &= ~np.logical_or.reduce([*scanned.values()])[box][tuple(nearest)]
+    guessed[box] &= (known < 0.5 * every)[tuple(nearest)]
     if guessed.any():
         guessed &= ~_looked_into(void, scanned, surface, scan, grid)
     return guessed

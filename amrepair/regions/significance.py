@@ -181,7 +181,9 @@ class Level:
     def rejected(self) -> Bool[np.ndarray, "2 s"]:
         """(2, s) windows whose deviation is significant."""
         far = self.beyond_mm > self.far_off_mm[:, None]
-        return np.asarray(far & (self.z > self.critical[:, None]))
+        # a wall's end lies deep or is none: what sound places stray by tells nothing of it
+        critical = np.where(self.scale.apart, self.quantile, self.critical[:, None])
+        return np.asarray(far & (self.z > critical))
 
     @property
     def chance_mm(self) -> Values:
@@ -341,13 +343,15 @@ def _wander(
     apart than errors hang together: a layer that lacks as a whole is no error. By how well the
     worse one was seen.
     """
-    pick = np.arange(0, len(scale), max(len(scale) // options.most_windows, 1))
+    own = ~scale.apart  # how deep a wall's end lies tells nothing of errors
+    place_mm, normal = scale.place_mm[own], scale.normal[own]
+    pick = np.arange(0, len(place_mm), max(len(place_mm) // options.most_windows, 1))
     # places farther apart than errors reach: so many tell of them on their own
-    cell = cells_of(scale.place_mm, 0.0, 0.5 * options.far_mm)
-    patch_of = cell_numbers(np.column_stack([cell, ways_of(scale.normal)]))
+    cell = cells_of(place_mm, 0.0, 0.5 * options.far_mm)
+    patch_of = cell_numbers(np.column_stack([cell, ways_of(normal)]))
     # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
     off_mm, worse, touched = scales_kernels.differences_apart(
-        scale.place_mm, scale.normal, scale.median_mm, group, patch_of, pick,
+        place_mm, normal, scale.median_mm[own], group[own], patch_of, pick,
         0.5 * options.far_mm, options.far_mm, WINDOW_FACING, classes,
     )  # fmt: skip
     off_mm /= PAIR_QUARTILE
@@ -407,7 +411,7 @@ def _level(
     safe = np.clip(z, 0.0, MOST_ERRORS)
     log_p = np.log(n * ways) + together * log_ndtr(-safe)
     far_off_mm = np.zeros(2)
-    low, high = (_peaks(scale, side > options.tail_from, side) for side in z)
+    low, high = (_peaks(scale, (side > options.tail_from) & ~scale.apart, side) for side in z)
     for side, peaks in enumerate((low, high)):
         if calibration is not None:
             width_mm = scale.width_mm if statistic else None
@@ -415,7 +419,8 @@ def _level(
             log_p[side] = np.maximum(log_p[side], far_off.log_expected(beyond_mm[side]))
             far_off_mm[side] = far_off.exceeded_by(share)
         elif (tail := _tail(peaks, options)).scale > 0:
-            log_p[side] = np.maximum(log_p[side], tail.log_expected(safe[side]))
+            by_tail = np.maximum(log_p[side], tail.log_expected(safe[side]))
+            log_p[side] = np.where(scale.apart, log_p[side], by_tail)
             critical[side] = max(critical[side], tail.exceeded_by(share))
     return Level(
         scale, errors, tolerance_mm, error_mm, freedom, beyond_mm, z, critical, far_off_mm,

@@ -63,9 +63,10 @@ class WallEnds:
     Attributes
     ----------
     place_mm, normal
-        (e, 3) mean places, and unit normals (either sign) of the planes there.
+        (e, 3) mean places, and unit normals (either sign) of the wall's faces: in that direction it
+        matters how far a pose is off.
     depth_mm
-        (e,) how far below the part's surface, in the direction of the normal.
+        (e,) how far below the part's surface, in the direction that the end faces.
     count
         (e,) points in each.
     surfel
@@ -121,13 +122,13 @@ def wall_ends(
     across = np.abs((plane * face).sum(axis=1)) < WINDOW_FACING
     which, face, plane, through_mm = (told[across] for told in (which, face, plane, through_mm))
     ends = _goes_no_further(surface, points_mm[which], 0.5 * through_mm[:, None] * face, plane)
-    which, plane, through_mm = which[ends], plane[ends], through_mm[ends]
+    which, face, plane, through_mm = (told[ends] for told in (which, face, plane, through_mm))
     # of a bare cloud's plane nobody knows which way it faces
     depth_mm = np.minimum(
         _way_out(template, points_mm[which], plane, through_mm),
         _way_out(template, points_mm[which], -plane, through_mm),
     )
-    return _condensed(points_mm[which], plane, depth_mm, surfels.of_point[which])
+    return _condensed(points_mm[which], face, depth_mm, surfels.of_point[which])
 
 
 def _goes_no_further(
@@ -175,7 +176,7 @@ def _planes(
     return np.asarray(np.linalg.eigh(np.swapaxes(off, 1, 2) @ off)[1][:, :, 0])
 
 
-def _condensed(points_mm: Points, plane: Points, depth_mm: Values, surfel: Numbers) -> WallEnds:
+def _condensed(points_mm: Points, face: Points, depth_mm: Values, surfel: Numbers) -> WallEnds:
     """What points say, by the cell of the field that they lie in."""
     cells, of_point = np.unique(surfel, return_inverse=True)
     count = np.bincount(of_point).astype(np.float64)
@@ -183,9 +184,9 @@ def _condensed(points_mm: Points, plane: Points, depth_mm: Values, surfel: Numbe
     def mean(value: Values) -> Float[np.ndarray, " c"]:
         return np.asarray(np.bincount(of_point, value, len(cells)) / count)
 
-    # planes have no sign: all of a cell are turned to one side
-    turn = np.sign((plane * plane[np.unique(of_point, return_index=True)[1]][of_point]).sum(axis=1))
-    turned = plane * np.where(turn < 0.0, -1.0, 1.0)[:, None]
+    # some points are nearer to one face and some to the other: all of a cell are turned to one side
+    side = (face * face[np.unique(of_point, return_index=True)[1]][of_point]).sum(axis=1)
+    turned = face * np.where(side < 0.0, -1.0, 1.0)[:, None]
     normal = np.stack([mean(part) for part in turned.T], axis=1)
     largest = np.take_along_axis(normal, np.abs(normal).argmax(axis=1)[:, None], axis=1)
     normal *= np.where(largest < 0.0, -1.0, 1.0) / np.linalg.norm(normal, axis=1, keepdims=True)

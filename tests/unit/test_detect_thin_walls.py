@@ -13,6 +13,7 @@ from functools import cache
 import manifold3d as m3
 import numpy as np
 import pytest
+import trimesh
 
 from amrepair.deficit import compute_deficit
 from amrepair.frames import Transform
@@ -97,6 +98,27 @@ def test_an_end_is_no_neighbour_of_the_cells_beside_it() -> None:
     """A bite of 8.5 mm³ was lost where the two were one window: they differ by more than noise."""
     gone = pieces(1.6)["bite"] ^ tube(1.6)
     assert found_ratio(bare(seen(tube(1.6) - gone)), 1.6, gone) > 0.7
+
+
+@pytest.mark.parametrize("seed", [2, 0, 3])
+def test_of_a_cup_of_one_bead_s_wall_the_upper_half_is_found_all_around(seed: int) -> None:
+    """Where chance left a gap in the scanned end a wedge was left standing over it (0.91 found,
+    seed 2), in the way of the whole repair; ends were compared with sound places that face as they
+    do, so that a scanner seemed to err by half a millimetre (nothing found, seeds 0 and 3).
+    """
+
+    def cone(radius_mm: float) -> m3.Manifold:
+        return m3.Manifold.cylinder(20, radius_mm, radius_mm + 3, 96)
+
+    whole = cone(12.0) - cone(11.55).translate((0, 0, 1.2))
+    rest, gone = (whole.trim_by_plane((0, 0, way), way * 10) for way in (-1, 1))
+    mesh = solid_mesh(rest)
+    rng = np.random.default_rng(seed)
+    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / 0.06), seed=seed)
+    scan = Scan(points + rng.normal(0.0, 0.04, points.shape), 0.04, "template")
+    template = MeshSdf.from_mesh(solid_mesh(whole))
+    deficit = compute_deficit(scan, template, detect(scan, template), build_from_template=IN_PLACE)
+    assert (deficit.missing ^ gone).volume() > 0.94 * gone.volume()
 
 
 def test_points_that_stray_into_a_sound_wall_are_no_ends_of_it() -> None:
