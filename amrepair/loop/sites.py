@@ -50,7 +50,7 @@ LEFT_OPEN_LAYERS = 2.0
 RIMS = ("perimeter", "wall")  # what slicers call it
 # Of the nozzle's bore: the narrowest gap that slicers fill; what is ironed is given less, a tenth
 # of a line whose neighbour lies a tenth of a millimetre off.
-NARROWEST_BORES = 0.2
+IRONS_BORES = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +258,7 @@ def _with_its_head(job: Job, at: Callable[[Stop], Site]) -> Callable[[Stop], Sit
 def irons(beads: Beads, setup: PrintSetup) -> Mask:
     """Which lines only smooth what lies there: they are given less plastic than any line is."""
     width_mm = beads.section_mm2 / np.maximum(beads.height_mm, 1e-6)
-    return np.asarray(width_mm < NARROWEST_BORES * setup.printer.nozzle_diameter_mm)
+    return np.asarray(width_mm < IRONS_BORES * setup.printer.nozzle_diameter_mm)
 
 
 def _highest_mm(start: Points, end: Points, pick: Mask) -> float | None:
