@@ -14,6 +14,9 @@ from gcode.errors import InputError
 
 WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 """A letter and its number."""
+_AS_VOLUME = ("; use_volumetric_e = 1", ";FLAVOR:Marlin(Volumetric)", ";FLAVOR:UltiGCode")
+"""How slicers say that E is cubic millimetres: PrusaSlicer and its kin, Cura."""
+AS_LENGTH = "millimetres of filament: have the slicer write E as a length (no 'volumetric E')"
 _CODE = re.compile(r"([GMTP])\s*0*(\d+)(?:\.(\d+))?(?![\d._]|[A-Z][A-Z_])")
 
 
@@ -152,3 +155,13 @@ def number(value: float, digits: int) -> str:
     if "." in text:
         text = text.rstrip("0").rstrip(".")
     return "0" if text in {"-0", ""} else text
+
+
+def volume_line(text: str) -> int | None:
+    """The line, counted from 1, at which a slicer says that a job's E is cubic millimetres."""
+    for said in _AS_VOLUME:
+        at = text.find(said)
+        end = at + len(said)
+        if at >= 0 and text[max(at - 1, 0) : at] in {"", "\n"} and text[end : end + 1] in "\r\n":
+            return text.count("\n", 0, at) + 1
+    return None

@@ -124,10 +124,15 @@ def align(
             f"the guess starts from frame {guess.source}, the scan {scan.source} is in {scan.frame}"
         )
     sigma_mm, inlier_mm = options.explained.limits_mm(scan.sigma_mm)
-    refined = _from_guess(scan, template, so_far, aside, guess, sigma_mm, options, rng)
+    refined, as_wide = _from_guess(scan, template, so_far, aside, guess, sigma_mm, options, rng)
     progress("align", 1.0, 1.0)
     ratio = float((np.abs(refined.residual_mm) <= inlier_mm).mean())
-    _refuse_misfit(scan, refined, ratio, inlier_mm, options.guess.least_explained, "")
+    least = options.guess.least_explained
+    # what lies in the part is missing of it: only what stands out of it speaks for another
+    stands_out = float((refined.residual_mm > inlier_mm).mean())
+    if as_wide and stands_out <= 1.0 - options.least_of_rest:
+        least = options.guess.least_if_within
+    _refuse_misfit(scan, refined, ratio, inlier_mm, least, "")
     answer = Found(refined, (), ratio, scan.points_mm, 0.0, sigma_mm, inlier_mm)
     return _registration(scan, answer, options)
 
@@ -306,7 +311,8 @@ def _from_guess(
     sigma_mm: float,
     options: AlignOptions,
     rng: np.random.Generator,
-) -> Refined:
+) -> tuple[Refined, bool]:
+    """The pose, and whether what is seen of the part is as wide in X and Y as it is."""
     least, most = options.least_points, options.poses.dense_points
     bound_mm, bound_deg = options.guess.bound_mm, options.guess.bound_deg
     levelled, on_bed = guess.matrix, False
@@ -327,9 +333,10 @@ def _from_guess(
     points = in_order(thin_out(points, most, rng))
     wide = Prior(np.full(3, np.deg2rad(bound_deg)), np.full(3, bound_mm))
     prior = bed_prior(np.deg2rad(bound_deg), bound_mm, options.bed) if on_bed else wide
+    expected = template if so_far is None else so_far.planned
     found = refine(
         points,
-        template if so_far is None else so_far.planned,
+        expected,
         levelled,
         start_scale_mm=options.guess.start_scale_mm,
         end_scale_mm=options.poses.scale_mm(sigma_mm),
@@ -346,7 +353,9 @@ def _from_guess(
             f"{turned_deg:.2f}° away from where it should be (limits {bound_mm:g} mm and "
             f"{bound_deg:g}°); the part has come off and moved, or the calibration is wrong"
         )
-    return found
+    wide_mm = np.ptp(np.quantile(moved(points, found.matrix), [0.01, 0.99], axis=0), axis=0)
+    whole_mm = np.ptp(expected.bounds_mm, axis=0)
+    return found, bool((wide_mm >= options.guess.as_wide * whole_mm)[:2].all())
 
 
 def _part_only(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +24,7 @@ from amrepair.cli.options import (
     part_pose,
     sensors,
 )
-from amrepair.errors import AmrepairError, InputError
+from amrepair.errors import AlignmentError, AmrepairError, InputError
 from gcode.cli import console
 from gcode.cli.options import (
     JsonOption,
@@ -148,6 +149,9 @@ def repair(
         import numpy as np
 
         from amrepair.loop.afterwards import afterwards
+        from amrepair.loop.locate import BESIDE_THE_PART, of_roles
+        from amrepair.loop.looks import plan_stops
+        from amrepair.loop.sites import sites
         from amrepair.repair import Site, Stopwatch, plan_repair
         from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
         from amrepair.report.collect import plan_result
@@ -168,29 +172,31 @@ def repair(
             grid = grid_of(read_job, setup)
         with watch("template"):
             field = open_template(template, progress=bars)
+        alone = read_job is None or not of_roles(read_job.beads, BESIDE_THE_PART).any()
         if pose == OF_JOB and read_job is not None:
             with watch("locate"):
                 field, placed = where_the_job_prints_it(read_job, f"{job}", field, setup)
         guess = placed.inverse() if placed is not None and frame == "build" else None
-        site = Site(
-            field,
-            setup,
-            grid,
-            placed if frame == "scanner" else None,
+        site = Site(field, setup, grid, placed if frame == "scanner" else None)
+        if pose == OF_JOB and read_job is not None and placed is not None:
+            site = sites(read_job, field, placed, setup)(plan_stops(read_job, ())[-1])
+        site = replace(
+            site,
             on_fixture=on_fixture,
             part_is_known=part_is_known,
             damage_at_mm=damage_at_mm,
             calibration=known_errors,
         )
-        plan = plan_repair(
-            cloud,
-            site,
-            title=f"repair of {scan.name}",
-            guess=guess,
-            rng=np.random.default_rng(seed),
-            watch=watch,
-            progress=bars,
-        )
+        with _told_of_supports(None if alone or pose == OF_JOB else job):
+            plan = plan_repair(
+                cloud,
+                site,
+                title=f"repair of {scan.name}",
+                guess=guess,
+                rng=np.random.default_rng(seed),
+                watch=watch,
+                progress=bars,
+            )
         ranked: tuple[Turn, ...] = ()
         if turns and plan.unreachable_mm3 > WORTH_TURNING_RATIO * plan.deficit.missing_mm3:
             with watch("turns"):
@@ -251,6 +257,20 @@ def repair(
             console.out.print(line)
     if not within:
         raise typer.Exit(console.NOT_WITHIN_TOLERANCE)
+
+
+@contextmanager
+def _told_of_supports(job: Path | None) -> Iterator[None]:
+    """Within it, a scan that fits nothing is told what a job lays beside the part, where it may."""
+    try:
+        yield
+    except AlignmentError as error:
+        if job is None:
+            raise
+        raise AlignmentError(
+            f"{error}; {job} lays more than the part (skirt, brim, supports or a tower): if all of "
+            "it still stands where it was printed, say --part-pose job, and it is left aside"
+        ) from error
 
 
 def _damage_at(text: str | None, scan_frame: str) -> tuple[float, float] | None:

@@ -48,6 +48,9 @@ BESIDE_CELL_MM = 0.25
 # Lower than the drawing by more, a place is open: slopes and rounding make one.
 LEFT_OPEN_LAYERS = 2.0
 RIMS = ("perimeter", "wall")  # what slicers call it
+# Of the nozzle's bore: the narrowest gap that slicers fill; what is ironed is given less, a tenth
+# of a line whose neighbour lies a tenth of a millimetre off.
+IRONS_BORES = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,13 +191,14 @@ class _Part:
     def finished_site(self) -> Site:
         """Judged by its template."""
         every = self.own.beads.layer >= 0
+        drawn = every & ~irons(self.own.beads, self.setup)
         return Site(
             self.template,
             self.setup,
             self.grid,
             self.build_from_template,
             calibration=NORMAL_NOISE,
-            lines=lines_of_job(self.own, every, self.setup),
+            lines=lines_of_job(self.own, drawn, self.setup),
             beside=self._beside(self.job.end_of(self.turn), np.zeros_like(every)),
             raft=self.raft,
             finished=self.finished,
@@ -207,13 +211,15 @@ class _Part:
         z_mm = float(template_from_build.apply(np.array([[0.0, 0.0, stop.z_mm]]))[0, 2])
         done = (beads.line < stop.line) & (beads.layer >= 0)
         # a tower stands as it does: nothing of it is to be mended
-        judged = done & (beads.layer >= first_layer(self.own)) & ~of_roles(beads, TOWERS)
+        drawn = done & ~irons(beads, self.setup)
+        judged = drawn & (beads.layer >= first_layer(self.own)) & ~of_roles(beads, TOWERS)
         start, end = (
             template_from_build.apply(place[judged]) for place in (beads.start_mm, beads.end_mm)
         )
         section, height = beads.section_mm2[judged], beads.height_mm[judged]
         support = of_roles(beads, BESIDE_THE_PART)
-        level_mm = _highest_mm(start, end, ~support[judged])
+        ours = ~support[judged]
+        level_mm = _highest_mm(start, end, ours)
         planned = (
             PlannedSdf.from_beads(start, end, section, height, level_mm=level_mm)
             if by_beads
@@ -228,8 +234,8 @@ class _Part:
             stop.z_mm,
             calibration=NORMAL_NOISE,
             planned=planned,
-            beads=PlannedBeads.recent(start, end, section, height),
-            lines=lines_of_job(self.own, done, self.setup),
+            beads=PlannedBeads.recent(start, end, section, height, ~ours),
+            lines=lines_of_job(self.own, drawn, self.setup),
             surface=(planned or below).surface_points(RegionOptions().spacing_mm),
             beside=self._beside(stop.line, judged if by_beads else np.zeros_like(judged)),
             strands=_beside(self.own, judged & support) if by_beads else None,
@@ -247,6 +253,12 @@ def _with_its_head(job: Job, at: Callable[[Stop], Site]) -> Callable[[Stop], Sit
         return replace(site, setup=setup_for_head(site.setup, job.program.text, tool))
 
     return found
+
+
+def irons(beads: Beads, setup: PrintSetup) -> Mask:
+    """Which lines only smooth what lies there: they are given less plastic than any line is."""
+    width_mm = beads.section_mm2 / np.maximum(beads.height_mm, 1e-6)
+    return np.asarray(width_mm < IRONS_BORES * setup.printer.nozzle_diameter_mm)
 
 
 def _highest_mm(start: Points, end: Points, pick: Mask) -> float | None:

@@ -42,27 +42,39 @@ class PlannedBeads:
         (n, 3) nozzle positions; a bead hangs below them by its height.
     width_mm, height_mm
         (n,) of its section, a rectangle.
+    strays
+        (n,) whose lines lie as they like: a support's, thin and free on both sides. None: of none.
     """
 
     start_mm: Points
     end_mm: Points
     width_mm: Values
     height_mm: Values
+    strays: Mask | None = None
 
     @classmethod
     def recent(
-        cls, start_mm: Points, end_mm: Points, section_mm2: Values, height_mm: Values
+        cls,
+        start_mm: Points,
+        end_mm: Points,
+        section_mm2: Values,
+        height_mm: Values,
+        strays: Mask | None = None,
     ) -> PlannedBeads:
         """Those near the highest, of beads as a job tells them: as wide as section over height."""
         high_mm = np.maximum(start_mm[:, 2], end_mm[:, 2])
         width_mm = section_mm2 / np.maximum(height_mm, 1e-6)
-        every = cls(start_mm, end_mm, width_mm, height_mm)
+        every = cls(start_mm, end_mm, width_mm, height_mm, strays)
         return every.some(high_mm > high_mm.max(initial=-np.inf) - RECENT_MM)
 
     def some(self, which: Mask | Int[np.ndarray, " k"]) -> PlannedBeads:
         """Some of them."""
         return PlannedBeads(
-            self.start_mm[which], self.end_mm[which], self.width_mm[which], self.height_mm[which]
+            self.start_mm[which],
+            self.end_mm[which],
+            self.width_mm[which],
+            self.height_mm[which],
+            None if self.strays is None else self.strays[which],
         )
 
     def samples_mm(self, step_mm: float) -> Points:
@@ -265,6 +277,8 @@ class _Looks:
         (k,) how much lower than its layer it was laid.
     rays_mm
         (k,) how far in the open rays say that the middle lies.
+    strays
+        (k,) of lines that lie as they like.
     """
 
     middle_mm: Points
@@ -273,6 +287,7 @@ class _Looks:
     along: Float[np.ndarray, "k 2"]
     sunk_mm: Values
     rays_mm: Values
+    strays: Mask
 
     @classmethod
     def planned(cls, paths: _Paths) -> _Looks:
@@ -282,7 +297,8 @@ class _Looks:
         over_mm = (lines.end_mm - lines.start_mm)[line, :2]
         along = over_mm / np.maximum(np.linalg.norm(over_mm, axis=1), LEVEL)[:, None]
         sunk_mm, rays_mm = np.zeros((2, len(line)))
-        return cls(paths.middles_mm, half_mm, width_mm, along, sunk_mm, rays_mm)
+        strays = np.zeros(len(line), bool) if lines.strays is None else lines.strays[line]
+        return cls(paths.middles_mm, half_mm, width_mm, along, sunk_mm, rays_mm, strays)
 
     def as_laid(
         self, beads: PlannedBeads, evidence: Evidence, template: Template, options: SkippedOptions
@@ -558,12 +574,13 @@ def _sag(
     """(k,) how much lower than planned each line lies if it is there, in heights of a line.
 
     One that rests on the layer below lies where it should, and one that hangs may lie lower by its
-    height. A line over the rim of what is below, as in walls that lean and in cubic infill, spreads
-    over it: how low it lies then, lines about that are held alike tell, of which so many are there.
+    height; so may one that strays: rays see both its sides, and run past it. A line over the rim of
+    what is below, as in walls that lean and in cubic infill, spreads over it: how low it lies then,
+    lines about that are held alike tell, of which so many are there.
     """
     held = looks.held(template, options)
-    sag = np.where(held == 0, 1.0, 0.0)
-    rim = (held > 0) & (held < options.held_places)
+    sag = np.where((held == 0) | looks.strays, 1.0, 0.0)
+    rim = (held > 0) & (held < options.held_places) & ~looks.strays
     if not rim.any():
         return sag
     alike = planned.held(template, options)

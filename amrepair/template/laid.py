@@ -323,8 +323,11 @@ class LaidBeads:
     def _strand_mm(self, k: int) -> float:
         """How much lower a layer's strands lie where they hang."""
         mine = slice(int(self.first[k]), int(self.first[k + 1]))
-        high_mm = self.layer_mm[k : k + 1]
-        width_mm = np.median(self.section_mm2[mine], keepdims=True) / high_mm
+        high_mm, section_mm2 = self.layer_mm[k : k + 1], self.section_mm2[mine]
+        plastic = section_mm2 * np.linalg.norm(self.end_mm[mine] - self.start_mm[mine], axis=1)
+        order = np.argsort(section_mm2)
+        half = np.searchsorted(np.cumsum(plastic[order]), 0.5 * plastic.sum())
+        width_mm = section_mm2[order[half : half + 1]] / high_mm
         return float(strands_hang_lower_mm(width_mm, high_mm)[0])
 
     def _walls(

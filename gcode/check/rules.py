@@ -27,6 +27,7 @@ from gcode.check.words import (
     without_lists,
     words_of,
 )
+from gcode.dialects import AS_LENGTH, volume_line
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrintSetup
 from gcode.profiles.own_settings import SAME_NOZZLE_MM
@@ -91,6 +92,7 @@ class Judge(Motion):
         super().__init__(program, setup, standing_top_mm, initial, policy)
         self._touches = planned
         self._laid_down = False  # the head that was chosen
+        self._volume_line = volume_line(program.text)
         self.added: tuple[str, ...] = ()
         macros = {macro.split(maxsplit=1)[0].upper() for macro in setup.printer.macros}
         self._begins, self._ends = setup.printer.start_macro, setup.printer.end_macro
@@ -173,6 +175,9 @@ class Judge(Motion):
         somebody asked to leave them.
         """
         self._backwards(text)
+        if self._volume_line is not None:
+            self._line, self._text = self._volume_line, text.line(self._volume_line)
+            self._refuse("extrusion told as a volume", "mm³", AS_LENGTH)
         if self._end_homed and self.moves.sums.way_mm > self._end_homed[1]:
             self._line, self._text = self._end_homed[0], text.line(self._end_homed[0])
             self._refuse("homing Z onto a standing part", "printing goes on", "at the end alone")
@@ -374,7 +379,8 @@ class Judge(Motion):
         elif name in {"G10", "M568"} and self._dialect == "reprap" and {"P", "L"} & words.keys():
             self._tool_settings(name, words)
         elif name in {"G10", "G11"}:
-            self._refuse("firmware retraction", name, "its length is not in the program")
+            told = "firmware retraction, whose length no program tells"
+            self._refuse(told, name, "G1 E: switch it off in the slicer")
         elif name in limits.LIMIT_COMMANDS:
             for raised in limits.raised_by(name, words, self._setup.printer, self._dialect):
                 self._raised(*raised)
@@ -408,7 +414,7 @@ class Judge(Motion):
                 told = " ".join(f"{letter}{value or 0:g}" for letter, value in words.items())
                 self._refuse("cold extrusion allowed", told or name, f"S{LEAST_COLD_C:g} and more")
         elif name == "M200" and (words.get("D") or words.get("S")):
-            self._refuse("extrusion told as a volume", name, "D0")
+            self._refuse("extrusion told as a volume", name, AS_LENGTH)
         elif name in {"G27", "M132", "P0"}:  # where it parks, and where its end stops are
             self._place = [None, None, self._place[2] if name == "P0" else None]
             self._laid_down = self._laid_down or name == "P0"

@@ -133,14 +133,21 @@ def job_of(path: Path, setup: PrintSetup) -> Job:
 
 
 def grid_of(job: Job | None, setup: PrintSetup) -> LayerGrid:
-    """Layers of a job; without one, those of the process profile."""
+    """Layers of a job; without one, those of the process profile.
+
+    Of objects that are printed one after another those of the highest; a layer that is laid no
+    lower than the next is pressed down by it.
+    """
     from gcode.slicing.layers import LayerGrid
 
     if job is None:
         return LayerGrid.from_setup(setup)
-    return LayerGrid.from_tops(
-        [layer.z_mm for layer in job.layers], layer_height_mm=setup.process.layer_height_mm
-    )
+    highest = max(job.turns, key=lambda turn: job.layers[turn.end_layer - 1].z_mm)
+    tops_mm: list[float] = []
+    for layer in reversed(job.layers[highest.first_layer : highest.end_layer]):
+        if not tops_mm or layer.z_mm < tops_mm[-1]:
+            tops_mm.append(layer.z_mm)
+    return LayerGrid.from_tops(tops_mm[::-1], layer_height_mm=setup.process.layer_height_mm)
 
 
 def standing_on_bed(path: Path, printer: PrinterProfile | None = None) -> HeightField:

@@ -13,6 +13,7 @@ from statistics import median
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from gcode.dialects import AS_LENGTH, volume_line
 from gcode.errors import ReadError
 from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile
@@ -33,6 +34,7 @@ _LEAST_LAYER_MM = 0.015
 ROUNDED_Z_MM = 1e-4  # jobs are written to a thousandth of a millimetre
 _SQUARE_LOSS = 1.0 - math.pi / 4.0
 UNKNOWN_ROLE = "unknown"
+IRONING = "ironing"  # PrusaSlicer, OrcaSlicer, Bambu Studio
 NOTHING_LAID = "The program extrudes nothing; it is no print job."
 
 
@@ -240,6 +242,12 @@ def read_job(
     """
     if isinstance(program, str):
         program = Program(program, dialect)
+    volume = volume_line(program.text)
+    if volume is not None:
+        raise ReadError(
+            f"Line {volume} says that the program tells extrusion as a volume, E in mm³; nothing "
+            f"here reads it but as {AS_LENGTH}."
+        )
     progress("read", 0.0, READ_STEPS)
     block = BlockReader(program.dialect, nozzles).read(program.text, progress)
     end, owner, filament = block.end_mm, block.line, block.filament_mm
@@ -413,6 +421,8 @@ def _beads(block: Block, layers: tuple[JobLayer, ...], diameter_mm: float) -> Be
     height = _stated(comments, owner, _HEIGHT)
     own = np.where(layer >= 0, heights[np.maximum(layer, 0)], heights[0])
     height = np.where(np.isfinite(height) & (height > 0), height, own)
+    ironed = np.isin(role_of_line, [k for k, name in enumerate(roles) if name.lower() == IRONING])
+    height = _as_high_as_the_rest(height, own, ironed, layer)
     lengths_mm = np.linalg.norm(end - start, axis=1)
     section = filament * filament_area_mm2(diameter_mm) / lengths_mm
     guessed = section / np.maximum(height, 1e-6) + height * _SQUARE_LOSS
@@ -427,6 +437,21 @@ def _beads(block: Block, layers: tuple[JobLayer, ...], diameter_mm: float) -> Be
         line=owner,
         roles=roles,
     )
+
+
+def _as_high_as_the_rest(
+    height_mm: Float[np.ndarray, " n"],
+    layer_mm: Float[np.ndarray, " n"],
+    ironed: Bool[np.ndarray, " n"],
+    layer: Int[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Heights, those of what irons as of what it irons: slicers tell its plastic, spread thin."""
+    if not ironed.any():
+        return height_mm
+    tallest_mm = np.zeros(int(layer.max()) + 2)  # the last: before the first layer
+    np.maximum.at(tallest_mm, layer[~ironed], height_mm[~ironed])
+    of_rest_mm = tallest_mm[layer]
+    return np.where(ironed, np.where(of_rest_mm > 0, of_rest_mm, layer_mm), height_mm)
 
 
 def _roles(

@@ -104,6 +104,7 @@ FAULTS = {
         "out of reach",
     ),
     "firmware retraction": ("G1 E-0.8 F2100\nG1 Z1", "G10\nG1 Z1", "firmware retraction"),
+    "extrusion told as a volume": ("M107\n", "; use_volumetric_e = 1\nM107\n", "as a volume"),
     "flow factor": ("M83\n", "M83\nM221 S900\n", "flow factor"),
     "speed factor": ("M83\n", "M83\nM220 S900\n", "speed factor"),
     "machine limit": ("M83\n", "M83\nM203 Z9000\n", "machine limit"),

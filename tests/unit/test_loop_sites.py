@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import manifold3d as m3
 import numpy as np
@@ -98,6 +98,43 @@ def test_a_tower_is_nothing_to_be_mended() -> None:
     assert site.beside is not None
     assert site.planned.bounds_mm[1, 0] < 130.0 < beside.beads.start_mm[tower, 0].min()
     assert site.beside.box_mm[0] > 130.0
+
+
+def ironed(job: Job) -> Job:
+    """The same job, each layer's lines gone over with a fortieth of their plastic."""
+    beads, n = job.beads, len(job.beads)
+    order = np.argsort(np.tile(beads.layer, 2), kind="stable")
+    per_bead = (f.name for f in fields(beads) if f.name != "roles")
+    twice = {name: np.concatenate([getattr(beads, name)] * 2)[order] for name in per_bead}
+    twice["section_mm2"] = np.where(order < n, 1.0, 1 / 40) * twice["section_mm2"]
+    return replace(job, beads=replace(beads, **twice))
+
+
+def test_what_is_ironed_is_no_line_to_be_laid_again() -> None:
+    """regression: half of a job's lines had no plastic to speak of, and a void was filled to 0.13
+    instead of 0.38."""
+    job, template = job_of(BLOCK), MeshSdf.from_mesh(solid_mesh(BLOCK))
+    for layers in ([10], []):
+        plain, smooth = (
+            sites(each, template, HERE, SETUP)(plan_stops(each, layers)[0])
+            for each in (job, ironed(job))
+        )
+        assert plain.lines is not None
+        assert smooth.lines is not None
+        assert np.array_equal(plain.lines.section_mm2, smooth.lines.section_mm2)
+        if layers:
+            assert plain.beads is not None
+            assert smooth.beads is not None
+            assert np.array_equal(plain.beads.width_mm, smooth.beads.width_mm)
+
+
+def test_a_support_s_lines_stray_and_the_part_s_do_not() -> None:
+    _, site = supported()
+    assert site.beads is not None
+    assert site.beads.strays is not None
+    aside = site.beads.start_mm[:, 0] > 111.0
+    assert aside.any()
+    assert np.array_equal(site.beads.strays, aside)
 
 
 def supported() -> tuple[Job, Site]:

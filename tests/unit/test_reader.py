@@ -55,6 +55,33 @@ def test_an_arc_is_as_long_as_its_circle() -> None:
     assert radius == pytest.approx(np.full(whole.sum(), 5.0), abs=1e-6)
 
 
+def test_what_is_ironed_is_as_high_as_its_layer() -> None:
+    """regression: PrusaSlicer tells its plastic, spread thin; layers were held to be as thin."""
+    text = "M83\n"
+    for k in range(3):
+        text += ";LAYER_CHANGE\n;HEIGHT:0.2\n;TYPE:Solid infill\n"
+        text += square(0.2 * (k + 1), 0, relative=True)
+        text += ";TYPE:Ironing\n;HEIGHT:0.0075\nG1 X20 Y10 E0.005\n;HEIGHT:0.2\n"
+    beads = read_job(text).beads
+    assert (beads.role == beads.roles.index("Ironing")).sum() == 3
+    assert beads.height_mm == pytest.approx(np.full(len(beads), 0.2))
+
+
+@pytest.mark.parametrize(
+    "said", ["; use_volumetric_e = 1", ";FLAVOR:Marlin(Volumetric)", ";FLAVOR:UltiGCode"]
+)
+def test_a_job_that_tells_extrusion_as_a_volume_is_refused(said: str) -> None:
+    """regression: beads were read 2.4 times too thick, and "the job prints another part"."""
+    text = "M83\n" + square(0.2, 0, relative=True)
+    for newline in ("\n", "\r\n"):
+        whole = f"{text}{said}\n; end\n".replace("\n", newline)
+        with pytest.raises(ReadError, match=r"Line 7 says .* as a volume"):
+            read_job(whole)
+    with pytest.raises(ReadError, match="Line 1 "):
+        read_job(f"{said}\n{text}")
+    read_job(f"{text}{said.replace('= 1', '= 0').replace('UltiG', 'G').replace('(V', '(v')}\n")
+
+
 def test_states_follow_modes_units_and_shifts() -> None:
     text = "G20\nG90\nM82\nG1 X1 Y2 Z0.1 E0.1 F100\nG91\nG1 X1 E0.2\nG92 E0\nM106 S255\nG21\n"
     job = read_job(text + "G90\nM83\nG1 X10 E1\nG1 X20 E1\n", dialect="prusa")
