@@ -6,6 +6,7 @@ Frames in use: `build` (bed corner at the origin, Z up), `scanner` (whatever the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,6 +154,12 @@ def in_box(
         inside &= along >= low
         inside &= along <= high
     return inside
+
+
+def nearest_box(boxes_mm: Sequence[Box], box_mm: Box) -> int:
+    """Number of the box whose corners lie nearest to another one's."""
+    off_mm = [float(np.abs(np.asarray(box) - box_mm).max()) for box in boxes_mm]
+    return int(np.argmin(off_mm))
 
 
 def boxes_meet(one: Box, other: Box) -> bool:

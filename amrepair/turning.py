@@ -16,6 +16,7 @@ from shapely.geometry import MultiPoint, Point
 
 from amrepair.errors import InputError
 from amrepair.repair import RepairPlan, Site
+from gcode.meshes import box_of_solid
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.layers import LayerGrid
@@ -127,7 +128,7 @@ def _tried(
     turn = NAMED_TURNS[name]
     printer = setup.printer
     rest = standing.rotate(turn)
-    low, high = np.array(rest.bounding_box()).reshape(2, 3)
+    low, high = box_of_solid(rest)
     size = high - low
     if (size[:2] > printer.bed_size_mm).any() or size[2] > printer.max_z_mm:
         return Turn(name, 0.0, stands=False)

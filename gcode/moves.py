@@ -204,6 +204,10 @@ class Program:
         """Lines without their newline."""
         return iter(self.text.splitlines())
 
+    def part(self, first: int, end: int) -> Program:
+        """Lines [first, end), as a program of their own."""
+        return Program("\n".join(self.text.split("\n", end)[first:end]) + "\n", self.dialect)
+
 
 @dataclass(frozen=True, slots=True)
 class ModalState:

@@ -26,13 +26,14 @@ from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.field.groups import area_per_point
-from amrepair.frames import Transform, box_of, boxes_meet, in_box
+from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
 from amrepair.regions.regions import classify
 from amrepair.regions.skipped import PlannedBeads, skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
+from gcode.meshes import box_of_solid
 from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
 
@@ -270,8 +271,8 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
             for k, region in enumerate(anomaly.regions)
             if region.label is piece.label and boxes_meet(region.box_mm, piece.box_mm)
         ]
-        off_mm = [np.abs(anomaly.regions[k].box_mm - piece.box_mm).max() for k in near]
-        pieces[near[int(np.argmin(off_mm))] if near else -1].append(piece)
+        known = [anomaly.regions[k].box_mm for k in near]
+        pieces[near[nearest_box(known, piece.box_mm)] if near else -1].append(piece)
     found = pieces[-1]
     for k, region in enumerate(anomaly.regions):
         own = pieces[k]
@@ -301,18 +302,17 @@ def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:
 def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Transform) -> Region:
     """Measures of one piece; its box in the build frame."""
     label, template = sought.label, sought.template
-    bounds = np.asarray(piece.bounding_box()).reshape(2, 3)
+    bounds = box_of_solid(piece)
     volume = float(piece.volume())
     area = float(piece.surface_area()) / 2
     depth = min(float(np.ptp(bounds, axis=0).min()), 2 * volume / max(area, 1e-9))
-    moved = piece.transform(build_from_template.matrix[:3])
     return Region(
         label,
         classify(label, depth, area, bounds, template),
         volume,
         area,
         depth,
-        np.asarray(moved.bounding_box()).reshape(2, 3),
+        box_of_solid(piece.transform(build_from_template.matrix[:3])),
         below_bead=volume < sought.options.bead_mm3,
         skipped=_is_skipped(bounds, sought.gone),
     )

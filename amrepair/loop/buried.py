@@ -14,7 +14,6 @@ from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.ways import Way
 from amrepair.repair import RepairPlan
 from gcode.estimate import estimate
-from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
 from gcode.slicing.patch import PatchRegion
@@ -69,11 +68,10 @@ def ways(
         return (leave,)
     beads, layer = job.beads, job.layers[first]
     again = (beads.layer >= first) & (beads.line < stop.line)
-    length_mm = np.linalg.norm(beads.end_mm[again] - beads.start_mm[again], axis=1)
     reprint = Way(
         "reprint", open_mm3, 0.0,
         print_time_s=_seconds(job, stop.line, setup) - _seconds(job, layer.first_line, setup),
-        filament_mm3=float(length_mm @ beads.section_mm2[again]),
+        filament_mm3=beads.subset(again).volume_mm3,
         layer=first, cut_to_mm=job.layers[first - 1].z_mm,
         command=f"{command} --layer {first}",
     )  # fmt: skip
@@ -93,5 +91,4 @@ def _first_layer(job: Job, stop: Stop, low_mm: float) -> int | None:
 
 def _seconds(job: Job, line: int, setup: PrintSetup) -> float:
     """Time of the job's moves up to a line."""
-    text = "\n".join(job.program.text.split("\n")[:line]) + "\n"
-    return estimate(Program(text, job.program.dialect), setup.printer).print_time_s
+    return estimate(job.program.part(0, line), setup.printer).print_time_s

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Box, PlanePoints, Values
-from amrepair.loop.layer_level import LayerLevel, lie_off
+from amrepair.frames import nearest_box
+from amrepair.loop.layer_level import LayerLevel
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Finding, judge
@@ -122,8 +123,7 @@ def _coming(job: Job, line: int, end_line: int) -> tuple[Program, ModalState] | 
         state = job.state_after(line)
     except ReadError:
         return None
-    text = "\n".join(job.program.text.split("\n", end_line)[line:end_line]) + "\n"
-    return Program(text, job.program.dialect), state
+    return job.program.part(line, end_line), state
 
 
 def findings(
@@ -149,19 +149,19 @@ def findings(
     """
     end_line = _line_after(job, layer_index, line)
     coming = functools.cache(partial(_coming, job, line, end_line))
-    pieces = plan.deficit.excess.decompose() if not plan.deficit.excess.is_empty() else []
+    pieces = plan.deficit.excess.decompose()
     found = []
     regions = plan.deficit.regions
     z_mm = None if layer_index is None else job.layers[layer_index].z_mm
     owners = _owners(objects, regions, line)
-    off = lie_off(LayerLevel.of(plan, z_mm) if regions else None, regions)
-    for region, whole_mm3, is_off, owner in zip(
-        regions, _whole_defects(regions, plan.policy), off, owners, strict=True
+    level = LayerLevel.of(plan, z_mm) if regions and z_mm is not None else None
+    for region, whole_mm3, owner in zip(
+        regions, _whole_defects(regions, plan.policy), owners, strict=True
     ):
         reach, hit = 1.0, 0.0
         if region.label is Label.MISSING:
             reach = reach_of(plan, region.box_mm)
-        elif end_line > line and height_mm(region) >= LEAST_HIT_LAYERS * plan.layer_height_mm:
+        elif end_line > line and region.height_mm >= LEAST_HIT_LAYERS * plan.layer_height_mm:
             piece, ahead = matching(pieces, region.box_mm), coming()
             if piece is not None and ahead is not None:
                 hit = hit_mm(*ahead, setup, piece)
@@ -173,7 +173,7 @@ def findings(
                 reachable_ratio=reach,
                 hit_mm=hit,
                 seen_twice=seen_twice,
-                layer_off=is_off,
+                layer_off=level is not None and level.is_off(region.box_mm),
                 object=owner[0],
                 lost_ratio=owner[1],
                 given_up=owner[2],
@@ -235,8 +235,8 @@ def _alone(region: Region, job: Job, layer_index: int | None, layer_mm: float) -
         confidence=1.0,
         volume_mm3=float(region.volume_mm3),
         defect_mm3=float(region.volume_mm3),
-        thickness_layers=thickness_mm(region) / layer_mm,
-        height_layers=float(height_mm(region) / layer_mm),
+        thickness_layers=region.thickness_mm / layer_mm,
+        height_layers=region.height_mm / layer_mm,
         reachable_ratio=1.0,
         cover=cover_of(job, layer_index, np.asarray(region.box_mm)),
         hit_mm=0.0,
@@ -245,22 +245,11 @@ def _alone(region: Region, job: Job, layer_index: int | None, layer_mm: float) -
     )
 
 
-def thickness_mm(region: Region) -> float:
-    """Mean thickness: the volume over half the surface, which is one side of a flat piece."""
-    return float(region.volume_mm3 / max(region.area_mm2, 1e-9))
-
-
-def height_mm(region: Region) -> float:
-    """From the lowest to the highest point of a region."""
-    return float(np.ptp(np.asarray(region.box_mm)[:, 2]))
-
-
 def matching(pieces: Sequence[manifold3d.Manifold], box_mm: Box) -> manifold3d.Manifold | None:
     """The piece whose box is nearest to a region's."""
     if not pieces:
         return None
-    boxes = [box_of_solid(piece) for piece in pieces]
-    return pieces[int(np.argmin([np.abs(box - box_mm).max() for box in boxes]))]
+    return pieces[nearest_box([box_of_solid(piece) for piece in pieces], box_mm)]
 
 
 def reach_of(plan: RepairPlan, box_mm: Box) -> float:

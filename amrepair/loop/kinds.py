@@ -95,8 +95,8 @@ def typed(
     if whole is None and seen is not None and plan.deficit.regions and not repaired:
         flow = _flow(seen[0], job, line, layer_mm, options)
     pieces = {
-        Label.MISSING: _pieces(plan.deficit.missing),
-        Label.EXCESS: _pieces(plan.deficit.excess),
+        Label.MISSING: plan.deficit.missing.decompose(),
+        Label.EXCESS: plan.deficit.excess.decompose(),
     }
     regions = []
     for region in plan.deficit.regions:
@@ -133,10 +133,6 @@ def _there(depth_mm: float, tolerance_mm: float) -> float:
 def _sure(value: float, limit: float) -> float:
     """Confidence of a measure against its limit: a half there, 0.9 at twice."""
     return float(1.0 - 0.5 ** ((value / max(limit, 1e-9)) ** 1.7))
-
-
-def _pieces(solid: manifold3d.Manifold) -> list[manifold3d.Manifold]:
-    return [] if solid.is_empty() else solid.decompose()
 
 
 def _surfaces(

@@ -8,7 +8,6 @@ beside a layer leaves its top where it is. Nothing is decided here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,6 @@ from scipy.special import stdtrit
 from amrepair.arrays import Box, Points, Values
 from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.policy import USUAL_POLICY
-from amrepair.regions import Region
 from amrepair.repair import RepairPlan
 
 
@@ -75,26 +73,10 @@ class LayerLevel:
     options: FlowOptions
 
     @classmethod
-    def of(
-        cls, plan: RepairPlan, z_mm: float | None, options: FlowOptions = FLOW_TEST
-    ) -> LayerLevel | None:
-        """Of the layer whose top is at z, build frame; None where too little of it was seen.
-
-        Parameters
-        ----------
-        z_mm
-            None for the finished part, which no layer follows.
-        """
-        if z_mm is None:
-            return None
-        placed = plan.build_from_template
-        return cls.of_points(
-            placed.apply(plan.anomaly.points_mm),
-            plan.anomaly.deviation_mm,
-            z_mm,
-            plan.layer_height_mm,
-            options,
-        )
+    def of(cls, plan: RepairPlan, z_mm: float) -> LayerLevel | None:
+        """Of the layer whose top is at z, build frame; None where too little of it was seen."""
+        place_mm = plan.build_from_template.apply(plan.anomaly.points_mm)
+        return cls.of_points(place_mm, plan.anomaly.deviation_mm, z_mm, plan.layer_height_mm)
 
     @classmethod
     def of_points(
@@ -146,8 +128,3 @@ class LayerLevel:
             centre = np.floor(0.5 * (box_mm[0, :2] + box_mm[1, :2]) / self.options.patch_mm)
             inside = (self.cell == centre.astype(np.int64)).all(axis=1)
         return np.asarray(inside)
-
-
-def lie_off(level: LayerLevel | None, regions: Sequence[Region]) -> list[bool]:
-    """For each region, whether its layer lies off there; nowhere where nobody can tell."""
-    return [level is not None and level.is_off(np.asarray(region.box_mm)) for region in regions]

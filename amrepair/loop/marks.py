@@ -9,11 +9,10 @@ import re
 
 from amrepair.errors import InputError
 from amrepair.loop.looks import Stop, end_stop
+from gcode.hosts.job_text import LOOK_COMMANDS
 from gcode.reader import Job
 
 LOOK_MARK = ";AMREPAIR_LOOK"
-ASKS = ("AMREPAIR_SCAN", "@amrepair scan")
-"""What a host pauses at and hands on; anything else that stands at a mark is the firmware's own."""
 _MARKED = re.compile(rf"^{LOOK_MARK} LAYER=(\d+) Z=(\S+)\s*$")
 
 
@@ -36,7 +35,7 @@ def marked_stops(job: Job, name: str, *, start: int = 0) -> tuple[Stop, ...]:
     for number, line in enumerate(lines[:-1]):
         if (found := _MARKED.match(line)) is None:
             continue
-        if not lines[number + 1].startswith(ASKS):
+        if not lines[number + 1].startswith(LOOK_COMMANDS):
             raise InputError(
                 f"{name}: line {number + 2} at a mark is {lines[number + 1].strip()!r}, which is "
                 "the firmware's own pause; mark the job for its host ('amrepair postprocess --for "

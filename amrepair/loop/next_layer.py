@@ -61,7 +61,7 @@ def gap_solids(
         (missing, Action.FILL_WITH_NEXT, 1.0),
         (excess, Action.LOWER_NEXT, -1.0),
     ):
-        pieces = solid.decompose() if not solid.is_empty() else []
+        pieces = solid.decompose()
         for verdict in verdicts:
             if verdict.action is action:
                 piece = matching(pieces, np.array(verdict.finding.box_mm))

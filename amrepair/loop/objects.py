@@ -70,8 +70,7 @@ class Objects:
         """What the job has laid of an object before a line."""
         beads, index = self.job.beads, self.found.names.index(name)
         own = (self.found.of_bead == index) & (beads.line < line)
-        lengths = np.linalg.norm(beads.end_mm[own] - beads.start_mm[own], axis=1)
-        return float(lengths @ beads.section_mm2[own])
+        return beads.subset(own).volume_mm3
 
     def giving_up(self, names: Sequence[str]) -> Objects:
         """The same without some more."""

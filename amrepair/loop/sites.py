@@ -67,7 +67,7 @@ class Expected:
 
     def __call__(self, stop: Stop) -> Site:
         """At one stop."""
-        return replace(self._at(stop), detector=self.detector)
+        return self._at(stop)
 
     def of(self, job: Job) -> Expected:
         """The same of another job: what is left of it, say."""
@@ -132,12 +132,13 @@ def _expected(
 
     def at(stop: Stop) -> Site:
         part = of(job.turn_at(stop.line))
-        if stop.layer_index is None and not ends_otherwise(part.turn):
-            return part.finished_site()
-        return part.site_at(stop, by_beads=by_beads)
+        by_template = stop.layer_index is None and not ends_otherwise(part.turn)
+        site = part.finished_site() if by_template else part.site_at(stop, by_beads=by_beads)
+        # a repair is laid by the head, or the filament, that is there: as its material asks
+        own = setup_for_head(site.setup, job.program.text, int(job.tools[stop.line]))
+        return replace(site, setup=own, detector=detector)
 
-    here = _with_its_head(job, at)
-    return Expected(template, build_from_template, setup, by_beads, detector, here, ends_otherwise)
+    return Expected(template, build_from_template, setup, by_beads, detector, at, ends_otherwise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,16 +244,6 @@ class _Part:
             finished=self.finished,
             laid=_laid(self.own, done, self.kept),
         )
-
-
-def _with_its_head(job: Job, at: Callable[[Stop], Site]) -> Callable[[Stop], Site]:
-    """A repair is laid by the head, or the filament, that is there: as its material asks."""
-
-    def found(stop: Stop) -> Site:
-        site, tool = at(stop), int(job.tools[stop.line])
-        return replace(site, setup=setup_for_head(site.setup, job.program.text, tool))
-
-    return found
 
 
 def irons(beads: Beads, setup: PrintSetup) -> Mask:

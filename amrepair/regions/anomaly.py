@@ -79,6 +79,16 @@ class Region:
     skipped: bool = False
     p_value: float = float("nan")
 
+    @property
+    def thickness_mm(self) -> float:
+        """Mean thickness: the volume over half the surface, which is one side of a flat piece."""
+        return float(self.volume_mm3 / max(self.area_mm2, 1e-9))
+
+    @property
+    def height_mm(self) -> float:
+        """From the lowest to the highest point."""
+        return float(np.ptp(self.box_mm[:, 2]))
+
 
 @dataclass(frozen=True, slots=True)
 class AnomalyMap:

@@ -9,7 +9,7 @@ import manifold3d
 import numpy as np
 
 from amrepair.deficit import Deficit
-from amrepair.frames import Transform
+from amrepair.frames import Transform, nearest_box
 from amrepair.policy import PolicyOptions, worth
 from amrepair.regions import Label, Region
 from amrepair.repair.site import Site
@@ -24,7 +24,8 @@ def fillable(
     pieces = deficit.missing.decompose()
     boxes = [box_of_solid(piece) for piece in pieces]
     regions = [region for region in deficit.regions if region.label is Label.MISSING]
-    of_piece = [_region_of(piece, regions) if regions else None for piece in pieces]
+    known = [region.box_mm for region in regions]
+    of_piece = [regions[nearest_box(known, box)] if regions else None for box in boxes]
     lines = [region is not None and region.skipped for region in of_piece]
     keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces], lines, policy)
     filled = [
@@ -43,10 +44,3 @@ def lines_of(site: Site, deficit: Deficit, placed: Transform) -> JobLines | None
         return site.lines
     ends = [placed.apply(ends_mm) for ends_mm in (deficit.gone.start_mm, deficit.gone.end_mm)]
     return replace(site.lines, gone_mm=np.stack(ends, axis=1))
-
-
-def _region_of(piece: manifold3d.Manifold, regions: list[Region]) -> Region:
-    """The region that a piece is: the one whose box is nearest to its own."""
-    box = box_of_solid(piece)
-    off_mm = [float(np.abs(np.asarray(region.box_mm) - box).max()) for region in regions]
-    return regions[int(np.argmin(off_mm))]

@@ -67,29 +67,24 @@ def laid_aside(site: Site) -> Callable[[Points], Mask] | None:
 
     Below its top seen from above, off the bed, and off the part.
     """
-    if site.beside is None or site.build_from_template is None:
+    beside, placed, options = site.beside, site.build_from_template, site.options
+    if beside is None or placed is None:
         return None
-    return partial(_laid_aside, site.beside, site.build_from_template, site.template, site.options)
 
+    def aside(points_mm: Points) -> Mask:
+        height_mm = points_mm @ placed.rotation[2] + placed.translation_mm[2]
+        # what lies nearly on the bed is taken for it anyhow
+        over_mm = options.over_beside_mm
+        over_bed = (height_mm > options.on_bed_mm) & (height_mm < beside.top_mm + over_mm)
+        low = np.flatnonzero(over_bed)
+        xy_mm = placed.apply(points_mm[low])[:, :2]
+        high_mm = beside.sample(xy_mm, outside_mm=-np.inf) + over_mm
+        low = low[height_mm[low] < high_mm]
+        found = np.zeros(len(points_mm), dtype=bool)
+        if len(low):
+            found[low] = site.template.distance(points_mm[low]) >= options.off_the_part_mm
+        return found
 
-def _laid_aside(
-    beside: HeightField,
-    placed: Transform,
-    template: Template,
-    options: RepairOptions,
-    points_mm: Points,
-) -> Mask:
-    height_mm = points_mm @ placed.rotation[2] + placed.translation_mm[2]
-    # what lies nearly on the bed is taken for it anyhow
-    over_mm = options.over_beside_mm
-    over_bed = (height_mm > options.on_bed_mm) & (height_mm < beside.top_mm + over_mm)
-    low = np.flatnonzero(over_bed)
-    xy_mm = placed.apply(points_mm[low])[:, :2]
-    high_mm = beside.sample(xy_mm, outside_mm=-np.inf) + over_mm
-    low = low[height_mm[low] < high_mm]
-    aside = np.zeros(len(points_mm), dtype=bool)
-    if len(low):
-        aside[low] = template.distance(points_mm[low]) >= options.off_the_part_mm
     return aside
 
 

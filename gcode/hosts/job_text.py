@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
-LOOK_COMMANDS = (b"AMREPAIR_SCAN", b"@amrepair scan")
+LOOK_COMMANDS = ("AMREPAIR_SCAN", "@amrepair scan")
+"""What a host pauses at and hands on; anything else that stands at a mark is the firmware's own."""
 
 
 class JobText:
@@ -36,6 +37,6 @@ class JobText:
 
     def is_look(self, line: int) -> bool:
         """Whether the line before this one asks for a look."""
-        return 0 < line < len(self._lines) and self._lines[line - 1].strip().startswith(
-            LOOK_COMMANDS
-        )
+        if not 0 < line < len(self._lines):
+            return False
+        return self._lines[line - 1].strip().decode("utf-8", "replace").startswith(LOOK_COMMANDS)

@@ -15,7 +15,7 @@ from link_children import QUICK
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import LoopOptions, Records, Tape, run_loop
-from amrepair.loop.pick_up import pick_up_serial
+from amrepair.loop.pick_up import pick_up
 from amrepair.loop.setting import open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
@@ -114,7 +114,7 @@ def loop(
     printer = SerialPrinter(port, journal=book, dialect="prusa", timing=QUICK)
     code = 0
     try:
-        pick_up = pick_up_serial(printer, release_c=40.0) if go_on else None
+        found = pick_up(printer, release_c=40.0) if go_on else None
         if not go_on:
             printer.connect()
         report = run_loop(
@@ -125,7 +125,7 @@ def loop(
             sites(run.job, run.template, run.setting.placed, run.setup, by_beads=False),
             stops=run.stops,
             options=LoopOptions(silent_stops=int(rough), seed=run.setting.seed),
-            records=Records(RunFolder(here / "run").record, tape=tape, pick_up=pick_up),
+            records=Records(RunFolder(here / "run").record, tape=tape, pick_up=found),
         )
         told = (
             f"within: {report.within_tolerance}, looks: {len(report.looks)}, "

@@ -11,7 +11,7 @@ from link_children import QUICK
 from loop_children import Dying
 
 from amrepair.loop import LoopOptions, Records, run_loop
-from amrepair.loop.pick_up import pick_up_serial
+from amrepair.loop.pick_up import pick_up
 from amrepair.loop.probing import PortFeeler, ProbeScanner
 from amrepair.loop.setting import open_run
 from amrepair.loop.sites import sites
@@ -60,7 +60,7 @@ def loop(folder: str, port: str, go_on: bool = False, die_after: int = 0) -> int
     printer = SerialPrinter(port, journal=book, dialect=dialect, timing=QUICK)
     code = 0
     try:
-        pick_up = pick_up_serial(printer, release_c=40.0) if go_on else None
+        found = pick_up(printer, release_c=40.0) if go_on else None
         if not go_on:
             printer.connect()
         scanner = ProbeScanner(PortFeeler(printer, run.setup), run.job, run.setup)
@@ -72,7 +72,7 @@ def loop(folder: str, port: str, go_on: bool = False, die_after: int = 0) -> int
             sites(run.job, run.template, run.setting.placed, run.setup, by_beads=False),
             stops=run.stops,
             options=LoopOptions(seed=run.setting.seed),
-            records=Records(tape=Dying(here / "run", die_after), pick_up=pick_up),
+            records=Records(tape=Dying(here / "run", die_after), pick_up=found),
         )
         told = f"within: {report.within_tolerance}, touches: {scanner.felt[0].touches}"
     except BaseException as error:  # noqa: BLE001  # the test reads what it was
