@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -117,6 +118,10 @@ class Transform:
     def apply(self, points_mm: Points) -> Points:
         """(n, 3) points in the target frame, mm."""
         return moved(points_mm, self.matrix)
+
+    def solid(self, of: Any) -> Any:
+        """A `manifold3d.Manifold` in the target frame."""
+        return of.transform(self.matrix[:3])
 
     def rotate(self, vectors: Points) -> Points:
         """(n, 3) directions in the target frame."""

@@ -86,7 +86,7 @@ def turns_of(
         return ()
     placed = plan.build_from_template
     expected: manifold3d.Manifold = site.template.solid()
-    standing = expected.transform(placed.matrix[:3]) - plan.deficit.missing + plan.deficit.excess
+    standing = placed.solid(expected) - plan.deficit.missing + plan.deficit.excess
     return rank_turns(
         plan.deficit.missing, standing, names, setup=site.setup, grid=site.grid, progress=progress
     )

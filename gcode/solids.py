@@ -22,6 +22,7 @@ from gcode.meshes_kernels import index_of_corners, paired, put_in_table
 from gcode.solids_kernels import first_of_each
 from gcode.surfaces.sizes import PARSER_ERRORS, in_words
 from gcode.threemf import read_3mf
+from gcode.whole import why_no_file
 
 _log = logging.getLogger(__name__)
 
@@ -56,8 +57,7 @@ def read_solid(path: Path) -> Any:
     4560
     """
     if not path.is_file():
-        what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
-        raise InputError(f"{path}: {what}.")
+        raise InputError(f"{path}: {why_no_file(path)}.")
     if path.suffix.lower() not in SOLID_SUFFIXES:
         raise InputError(f"{path}: a solid is one of {', '.join(SOLID_SUFFIXES)}.")
     try:

@@ -50,6 +50,11 @@ def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> None:
         draft.write_bytes(data)
 
 
+def why_no_file(path: Path) -> str:
+    """What to tell of a path that is no file, where one is to be read."""
+    return "is a folder; name a file in it" if path.is_dir() else "there is no such file"
+
+
 def left_behind(folder: Path) -> Iterator[Path]:
     """What processes that were killed were writing, in a folder and those below it."""
     return (path for path in folder.rglob(".*") if _DRAFT.match(path.name))

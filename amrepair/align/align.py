@@ -12,6 +12,7 @@ from amrepair.align.anywhere import Found, explained_if_mirrored, pose_from_anyw
 from amrepair.align.bed import bed_prior, level_on_bed
 from amrepair.align.options import USUAL_ALIGN, AlignOptions
 from amrepair.align.pam import align_paper
+from amrepair.align.poses import explained
 from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.sizes import other_size, refuse_other_size
@@ -126,7 +127,7 @@ def align(
     sigma_mm, inlier_mm = options.explained.limits_mm(scan.sigma_mm)
     refined, as_wide = _from_guess(scan, template, so_far, aside, guess, sigma_mm, options, rng)
     progress("align", 1.0, 1.0)
-    ratio = float((np.abs(refined.residual_mm) <= inlier_mm).mean())
+    ratio = explained(refined, inlier_mm)
     least = options.guess.least_explained
     # what lies in the part is missing of it: only what stands out of it speaks for another
     stands_out = float((refined.residual_mm > inlier_mm).mean())
@@ -234,7 +235,7 @@ def _as_it_was_seen(
             end_scale_mm=scale_mm,
             sigma_mm=found.sigma_mm,
         )
-        ratio = float((np.abs(best.residual_mm) <= found.inlier_mm).mean())
+        ratio = explained(best, found.inlier_mm)
     return replace(found, best=best, others=tuple(others), explained_ratio=ratio)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from amrepair.align.options import PoseOptions
 from amrepair.align.refine import Refined, refine_all
 from amrepair.align.thinning import Thinned
-from amrepair.arrays import Matrix, Points
+from amrepair.arrays import Matrix, Points, Values
 from amrepair.frames import box_corners, diagonal, moved
 from amrepair.template.port import Template
 
@@ -66,7 +66,7 @@ class Clouds:
 
     def scored(self, pose: Refined) -> Scored:
         """With the mean of |f|, each up to the cap."""
-        return float(np.minimum(np.abs(pose.residual_mm), self.cap_mm).mean()), pose
+        return off_mm(pose.residual_mm, self.cap_mm), pose
 
     def apart(self, one: Matrix, other: Matrix) -> bool:
         """Whether two poses move the scan's box to different places."""
@@ -85,6 +85,11 @@ class Clouds:
 
 
 Scored = tuple[float, Refined]
+
+
+def off_mm(residual_mm: Values, cap_mm: float) -> float:
+    """The mean of |f|, each up to the cap: farther off is as bad."""
+    return float(np.minimum(np.abs(residual_mm), cap_mm).mean())
 
 
 def by_score(one: Scored) -> float:

@@ -115,11 +115,11 @@ def _colour() -> tuple[int, int, int]:
 def _refuse(path: Path) -> None:
     from amrepair.scans.files import SCAN_SUFFIXES
     from gcode.solids import SOLID_SUFFIXES as MESH_SUFFIXES
+    from gcode.whole import why_no_file
 
     known = PROGRAM_SUFFIXES | {".safetensors"} | set(MESH_SUFFIXES) | SCAN_SUFFIXES
     if not path.is_file():
-        what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
-        raise InputError(f"{path}: {what}")
+        raise InputError(f"{path}: {why_no_file(path)}")
     if path.suffix.lower() not in known:
         raise InputError(f"{path} cannot be shown; it is one of {', '.join(sorted(known))}")
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 from amrepair.cli.approval import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, ViewPlace, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
-from amrepair.cli.telling import Begun, placed_solid, tell, written
+from amrepair.cli.telling import Begun, tell, written
 from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import InputError
 from amrepair.fleet.desk import Desk
@@ -322,7 +322,7 @@ def print_run(
             scan_unit=setting.scan_unit,
         ),
     )  # fmt: skip
-    page.show_run(begun.job, placed_solid(begun.template, setting.placed))
+    page.show_run(begun.job, setting.placed.solid(begun.template.solid()))
     if not going_on:
         with bars.stage("connect"):
             machine.connect()

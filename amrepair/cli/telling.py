@@ -8,7 +8,6 @@ from typing import Any
 import typer
 
 from amrepair.errors import LoopError
-from amrepair.frames import Transform
 from amrepair.loop import LoopReport, Tape
 from amrepair.loop.learning import told
 from amrepair.loop.probing import Felt
@@ -17,7 +16,6 @@ from amrepair.repair import Stopwatch
 from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result, rounded
 from amrepair.report.folder import RunFolder
-from amrepair.template.port import Template
 from gcode.check import CheckedProgram
 from gcode.cli import console
 from gcode.cli.judging import warnings_json
@@ -58,7 +56,7 @@ def written(
             title=f"Run: {setting.title}",
             setup=setup,
             about={"job": setting.title},
-            expected=placed_solid(begun.template, setting.placed),
+            expected=setting.placed.solid(begun.template.solid()),
             temperatures=warmth,
         )
         write_report(data, folder.file("report.html"))
@@ -101,9 +99,3 @@ def exit_code_of(report: LoopReport) -> int:
     if report.stopped:
         return LoopError.exit_code
     return 0 if report.within_tolerance else console.NOT_WITHIN_TOLERANCE
-
-
-def placed_solid(template: Template, placed: Transform) -> Any:
-    """The part as it should be, where it stands."""
-    solid: Any = template.solid()
-    return solid.transform(placed.matrix[:3])

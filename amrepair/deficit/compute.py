@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import manifold3d
 import numpy as np
@@ -227,7 +226,7 @@ def _in_build_frame(
 ) -> manifold3d.Manifold:
     """Pieces, template frame, as one solid that stands on the bed; possibly empty."""
     whole = manifold3d.Manifold.batch_boolean(list(pieces), manifold3d.OpType.Add)
-    return whole.transform(build_from_template.matrix[:3])
+    return build_from_template.solid(whole)
 
 
 def _standing(
@@ -242,8 +241,7 @@ def _standing(
     options: DeficitOptions,
 ) -> HeightField:
     """What stands on the bed: the scan's heights, with the solids' walls and the points' own."""
-    designed: Any = template.solid()
-    expected = designed.transform(build_from_template.matrix[:3])
+    expected = build_from_template.solid(template.solid())
     solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess, options.heights)
     points_mm, spacing_mm = build_from_template.apply(scan.points_mm), evidence.spacing_mm
     sharp = with_sharp_walls(
@@ -312,7 +310,7 @@ def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Tra
         volume,
         area,
         depth,
-        box_of_solid(piece.transform(build_from_template.matrix[:3])),
+        box_of_solid(build_from_template.solid(piece)),
         below_bead=volume < sought.options.bead_mm3,
         skipped=_is_skipped(bounds, sought.gone),
     )

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import Any
 
 import manifold3d
 import numpy as np
@@ -65,8 +64,7 @@ def as_built_heights(
     z, seen = _tops(points, grid, options)
     known = seen
     if scan.sensors_mm is None:
-        solid: Any = template.solid()
-        placed = solid.transform(build_from_template.matrix[:3])
+        placed = build_from_template.solid(template.solid())
         designed_z = HeightField.from_manifold(placed, cell_mm, box_mm=grid.box_mm).z_mm
         designed_z = designed_z[:ny, :nx].astype(np.float64)
         bare = ~seen & (designed_z <= 0)

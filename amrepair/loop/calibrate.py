@@ -16,6 +16,7 @@ import manifold3d
 import numpy as np
 from jaxtyping import Float
 
+from amrepair.align.poses import off_mm
 from amrepair.align.refine import refine
 from amrepair.align.thinning import thin_out
 from amrepair.arrays import Points, Values, Vector
@@ -153,7 +154,7 @@ def calibrate(
     tried = thin_out(flat[above], options.tried_points, rng)
     angles = np.arange(options.turns) * 2 * np.pi / options.turns
     turns = [_turned(angle, tried, centre) for angle in angles]
-    cost = np.array([_cost(standing, turn, tried, options.cap_mm) for turn in turns])
+    cost = [off_mm(standing.distance(turn.apply(tried)), options.cap_mm) for turn in turns]
     near = np.abs(flat[:, 2]) < top_mm + 1.0
     cloud = thin_out(scan.points_mm[near & _around(flat, flat[above])], options.fit_points, rng)
     limit_mm, apart_rad = max(0.1, 3 * scan.sigma_mm), np.deg2rad(options.least_apart_deg)
@@ -258,11 +259,6 @@ def _turned(angle_rad: float, points: Points, centre: Vector) -> Transform:
     return Transform.from_rotation_translation(
         "build", "level", rotation=rotation, translation_mm=shift
     )
-
-
-def _cost(standing: Template, pose: Transform, points: Points, cap_mm: float) -> float:
-    distance = standing.distance(pose.apply(points))
-    return float(np.minimum(np.abs(distance), cap_mm).mean())
 
 
 @dataclass(frozen=True, slots=True)

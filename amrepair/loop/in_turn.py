@@ -6,8 +6,6 @@ end; from then on it is what the head must keep off.
 
 from __future__ import annotations
 
-from typing import Any
-
 import manifold3d
 import numpy as np
 import trimesh
@@ -120,9 +118,8 @@ def template_of(
                 tuple(template.boxes_mm[k] for k in own),
             )
     else:
-        whole: Any = template.solid()
-        moved = whole.transform(build_from_template.matrix[:3])
-        of_whole = whole.decompose()
+        of_whole = template.solid().decompose()
+        moved = build_from_template.solid(template.solid())
         pick = [_shares(box_of_solid(one), laid) for one in moved.decompose()]
         mine = [body for body, is_own in zip(of_whole, pick, strict=True) if is_own]
         if len(mine) == len(of_whole):

@@ -102,7 +102,7 @@ class _Inset:
         points, normals = self.whole.surface_points(spacing_mm)
         return points - self.depth_mm * normals, normals
 
-    def solid(self) -> object:
+    def solid(self) -> Any:
         return self.whole.solid()
 
 
@@ -154,8 +154,7 @@ def locate_parts(
         thing = np.unique(thing[higher], return_inverse=True)[1]
         pick = outermost(beads, ours, half_mm)
     count = int(thing.max(initial=-1)) + 1
-    bodies: Any = template.solid()
-    if len(bodies.decompose()) > 1:  # one part seems to be several things
+    if len(template.solid().decompose()) > 1:  # one part seems to be several things
         thing[:], count = 0, 1
     of_pick = thing[pick[ours]]
     found: list[Transform] = []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -277,9 +276,8 @@ def _laid(job: Job, which: Mask, kept: KeptFills) -> LaidBeads | None:
 def _left_open(job: Job, template: Template, build_from_template: Transform) -> bool:
     """Whether a job leaves holes of two beads' width in the part, open to above: no top, a vase."""
     beads = job.beads
-    solid: Any = template.solid()
     part = HeightField.from_manifold(
-        solid.transform(build_from_template.matrix[:3]),
+        build_from_template.solid(template.solid()),
         BESIDE_CELL_MM,
         margin_mm=USUAL_REPAIR.stray_mm,
     )

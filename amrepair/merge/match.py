@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from amrepair.align.coarse import by_features, poses_between
+from amrepair.align.options import SearchRound
 from amrepair.align.search import spread_rotations
 from amrepair.align.search_kernels import peaks
 from amrepair.arrays import Matrix, Vector
@@ -30,21 +31,10 @@ CELLS, SIDE = 72, 2.4
 APART_POINTS = 60  # of a view, that tell two poses apart
 
 
-@dataclass(frozen=True, slots=True)
-class Round:
-    """Of the search: points of each view, steps, scales in sizes, poses kept."""
-
-    points: int
-    steps: int
-    first: float
-    last: float
-    keep: int
-
-
-MATCH_ROUNDS = (
-    Round(150, 8, 0.15, 0.05, 400),
-    Round(300, 8, 0.05, 0.02, 120),
-    Round(800, 6, 0.02, 0.01, 20),
+MATCH_ROUNDS = (  # points are of each view, scales in sizes of the part
+    SearchRound(150, 8, 0.15, 0.05, 400),
+    SearchRound(300, 8, 0.05, 0.02, 120),
+    SearchRound(800, 6, 0.02, 0.01, 20),
 )
 
 
@@ -175,7 +165,7 @@ def _search(
         others = _sample(second, other, step.points, rng)
         scores = kernels.reconcile(
             kernels.Pair(*own, *others, space.field, other.field, CELLS), rotations, places,
-            np.geomspace(step.first, step.last, step.steps) * size, options.cap * size, 0.5 * size,
+            step.scales(size), options.cap * size, 0.5 * size,
         )  # fmt: skip
         order = np.argsort(free_counts * scores[:, 0] - scores[:, 1], kind="stable")
         chosen = peaks(order, rotations, places, 0.4 * size, 0.01 * size, step.keep)

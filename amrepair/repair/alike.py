@@ -106,6 +106,6 @@ def _repairs(site: Site, registration: Registration, deficit: Deficit) -> list[_
     repairs = []
     for pose in (template, *registration.symmetric_alternatives):
         motion = build @ pose @ template.inverse() @ build.inverse()
-        missing = deficit.missing.transform(motion.matrix[:3])
+        missing = motion.solid(deficit.missing)
         repairs.append(_Repair(pose, missing, motion.apply(centre_mm)[0, :2]))
     return repairs

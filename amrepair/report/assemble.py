@@ -60,14 +60,13 @@ def report_of_plan(
     """
     placed = plan.build_from_template
     enough = plan_is_enough(plan)
-    solid: Any = template.solid()
     return ReportData(
         title=title,
         outcome=outcome_of(result, within_tolerance=enough),
         figures=Figures.from_result(result),
         looks=(look_of(plan, "as scanned", printed=False),),
         setup={"scan": scan_name or Path(plan.scan.source).name, **_profiles(setup)},
-        expected=solid_mesh(solid.transform(placed.matrix[:3])),
+        expected=solid_mesh(placed.solid(template.solid())),
         regions=region_rows(plan),
         decisions=(decision_of_plan(plan, enough=enough, late=late),),
         seconds=result["seconds"],

@@ -29,6 +29,7 @@ from gcode.clouds.pcd import PcdHeader, read_pcd
 from gcode.clouds.ply import read_header, read_vertices
 from gcode.clouds.text import read_rows
 from gcode.surfaces.depth_maps import is_depth_map
+from gcode.whole import why_no_file
 
 POINT_SUFFIXES = frozenset(
     {".ply", ".pcd", ".ptx", ".pts", ".xyz", ".txt", ".csv", ".asc", ".npy", ".npz", ".png"}
@@ -91,8 +92,7 @@ def read_scan(
     """
     path = Path(path)
     if not path.is_file():
-        what = "is a folder; name a file in it" if path.is_dir() else "there is no such file"
-        raise InputError(f"{path}: {what}")
+        raise InputError(f"{path}: {why_no_file(path)}")
     given_mm = None if unit is None else mm_per(unit, f"{path}: the scan's unit is")
     # what overflows is refused as not finite
     with np.errstate(all="ignore"), refused_as_ours():

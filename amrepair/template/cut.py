@@ -91,4 +91,4 @@ class CutTemplate:
     def solid(self) -> Any:
         """The whole's solid, trimmed by the plane exactly."""
         # manifold3d keeps the side that the normal points to
-        return self.whole.solid().trim_by_plane((0.0, 0.0, -1.0), -self.z_mm)  # type: ignore[attr-defined]
+        return self.whole.solid().trim_by_plane((0.0, 0.0, -1.0), -self.z_mm)

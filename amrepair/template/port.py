@@ -42,7 +42,7 @@ class Template(Distances, Protocol):
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
         """(m, 3) points on the zero level about `spacing_mm` apart, and (m, 3) unit normals."""
 
-    def solid(self) -> object:
+    def solid(self) -> Any:
         """The interior as a `manifold3d.Manifold`, template frame, checked watertight."""
 
 

@@ -111,5 +111,5 @@ class StoodTemplate:
         """All copies as one `manifold3d.Manifold`."""
         one: Any = self.part.solid()
         return manifold3d.Manifold.batch_boolean(
-            [one.transform(pose.matrix[:3]) for pose in self.placed], manifold3d.OpType.Add
+            [pose.solid(one) for pose in self.placed], manifold3d.OpType.Add
         )

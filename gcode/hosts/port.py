@@ -124,43 +124,35 @@ class NothingMetError(PrinterError):
     """A touch ended where it was to end, and met nothing; heaters are off, the nozzle is lifted."""
 
 
-class LinkLostError(LinkError):
-    """The link was lost in mid-job; what is uncertain is named.
+class LinesInDoubtError(LinkError):
+    """Lines of a program may or may not have been executed; they are named, counted from 0.
 
     Attributes
     ----------
     last_executed_line
         The last program line known to be executed, -1 if none.
     last_sent_line
-        The last program line sent: those between may or may not have been executed.
-    why
-        What happened to the link, in a few words.
-    """
-
-    def __init__(
-        self, message: str, last_executed_line: int, last_sent_line: int, *, why: str = ""
-    ) -> None:
-        super().__init__(message)
-        self.why = why
-        self.last_executed_line = last_executed_line
-        self.last_sent_line = last_sent_line
-
-
-class ResumeRefusedError(LinkError):
-    """A job cannot be gone on with; what is uncertain is named, by program line from 0.
-
-    Attributes
-    ----------
-    last_executed_line
-        The last program line known to be executed, -1 if none.
-    last_sent_line
-        No line after this one was ever sent.
+        No line after this one was ever sent: those between are in doubt.
     """
 
     def __init__(self, message: str, last_executed_line: int, last_sent_line: int) -> None:
         super().__init__(message)
         self.last_executed_line = last_executed_line
         self.last_sent_line = last_sent_line
+
+
+class LinkLostError(LinesInDoubtError):
+    """The link was lost in mid-job; `why` says what happened to it, in a few words."""
+
+    def __init__(
+        self, message: str, last_executed_line: int, last_sent_line: int, *, why: str = ""
+    ) -> None:
+        super().__init__(message, last_executed_line, last_sent_line)
+        self.why = why
+
+
+class ResumeRefusedError(LinesInDoubtError):
+    """A job cannot be gone on with."""
 
 
 @runtime_checkable

@@ -23,7 +23,7 @@ from gcode.profiles import PrintSetup, expand_script
 from gcode.progress import Progress, silent
 from gcode.slicing import infill_kernels as kernels
 from gcode.slicing.beads import Bead, loop_bead, spacing_of
-from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unprintable
+from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unfilled
 from gcode.slicing.layers import LayerGrid, Slab, plan_slabs
 from gcode.slicing.objects import Labels, boxes_apart_mm
 from gcode.slicing.options import USUAL_PART, PartOptions
@@ -37,7 +37,7 @@ class PartPlan:
     """A job, what it leaves out, and the heights of its layers."""
 
     toolpath: Toolpath
-    unprintable: tuple[Unprintable, ...]
+    unprintable: tuple[Unfilled, ...]
     grid: LayerGrid
 
 
@@ -107,7 +107,7 @@ def plan_part(
     cuts = Cuts.of(solid, np.array([s.middle_mm for s in slabs]))
     layers = PartLayers(cuts, slabs, setup, options)
     pen = Pen(setup, np.array(setup.printer.park_mm, float))
-    lost: list[Unprintable] = []
+    lost: list[Unfilled] = []
     _begin(pen, setup, float(solid.bounding_box()[5]))
     seam_mm = np.array([-1e3, 1e3])
     labels = Labels(boxes_apart_mm(solid, setup.process.line_width_mm))
@@ -157,9 +157,9 @@ def _box_text(box: tuple[float, ...]) -> str:
     return "({:.2f}, {:.2f}, {:.2f}) to ({:.2f}, {:.2f}, {:.2f})".format(*box)
 
 
-def _merged(lost: list[Unprintable]) -> tuple[Unprintable, ...]:
+def _merged(lost: list[Unfilled]) -> tuple[Unfilled, ...]:
     """The same place in consecutive layers is one thing; they come from the lowest layer up."""
-    out: list[Unprintable] = []
+    out: list[Unfilled] = []
     open_mm, going_on = -math.inf, list[int]()  # what ends at this layer's foot, or in it
     for thing in lost:
         b = thing.box_mm
@@ -172,7 +172,7 @@ def _merged(lost: list[Unprintable]) -> tuple[Unprintable, ...]:
             if touches and abs(a[5] - b[2]) < 1e-6 and out[k].reason == thing.reason:
                 low, high = map(min, a[:3], b[:3]), map(max, a[3:], b[3:])
                 box: Any = (*low, *high)
-                out[k] = Unprintable(out[k].volume_mm3 + thing.volume_mm3, box, thing.reason)
+                out[k] = Unfilled(out[k].volume_mm3 + thing.volume_mm3, box, thing.reason)
                 break
         else:
             going_on.append(len(out))

@@ -26,8 +26,8 @@ from gcode.slicing.regions import SIMPLIFY_MM, flattened, offset, peel, pieces
 
 
 @dataclass(frozen=True, slots=True)
-class Unprintable:
-    """Something that no bead can make, by name: its volume, its box and why.
+class Unfilled:
+    """Something that no bead fills: its volume, its box and why.
 
     `box_mm` is (x_min, y_min, z_min, x_max, y_max, z_max), build frame.
     """
@@ -62,7 +62,7 @@ class LayerPlan:
     """What a layer is made of, and what of it no bead can make."""
 
     islands: tuple[Island, ...]
-    lost: tuple[Unprintable, ...]
+    lost: tuple[Unfilled, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,12 +188,12 @@ def _flow(layer: _Layer, slab: Slab, section: Any, options: PartOptions) -> floa
     return float(min(max(factor, least), most))
 
 
-def _listed(layer: _Layer, slab: Slab, options: PartOptions) -> list[Unprintable]:
+def _listed(layer: _Layer, slab: Slab, options: PartOptions) -> list[Unfilled]:
     out = []
     for part in layer.lost:
         volume = part.area() * slab.height_mm
         x0, y0, x1, y1 = part.bounds()
         box = (x0, y0, slab.bottom_mm, x1, y1, slab.top_mm)
         if volume > options.least_left_mm3:
-            out.append(Unprintable(volume, box, "thinner than half a nozzle"))
+            out.append(Unfilled(volume, box, "thinner than half a nozzle"))
     return out

@@ -19,7 +19,7 @@ from gcode.moves import Toolpath
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.job_lines import JobLines
-from gcode.slicing.layer_plan import Unprintable
+from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import USUAL_PATCH, PatchOptions
 from gcode.slicing.patch_laying import after_first, begin, emit, end, first_pass_words
@@ -28,7 +28,6 @@ from gcode.slicing.patch_left import (
     LeftCause,
     LeftColumns,
     PatchRegion,
-    Unreachable,
     left_over,
     not_worth_it,
 )
@@ -43,7 +42,7 @@ __all__ = [
     "LeftColumns",
     "PatchPlan",
     "PatchRegion",
-    "Unreachable",
+    "Unfilled",
     "slice_patch",
 ]
 
@@ -69,8 +68,8 @@ class PatchPlan:
     toolpath: Toolpath
     beads_mm3: float
     reachable_mm3: float
-    unreachable: tuple[Unreachable, ...]
-    unprintable: tuple[Unprintable, ...]
+    unreachable: tuple[Unfilled, ...]
+    unprintable: tuple[Unfilled, ...]
     regions: tuple[PatchRegion, ...]
     first_pass: str
     left: tuple[LeftColumns, ...] = ()

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from gcode.slicing.layer_plan import Unprintable
+from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_state import PatchState
 
@@ -17,15 +17,6 @@ COVERED = "covered by what stands above it"
 NOT_CLOSED = "; the little in reach would not close it"
 TOO_SMALL = "too small for a bead, or with nothing below it to hold one"
 Box = tuple[float, float, float, float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Unreachable:
-    """A piece of the deficit that the nozzle cannot get to; the box is in the build frame."""
-
-    volume_mm3: float
-    box_mm: Box
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +73,8 @@ class LeftOver:
     And where that is, column by column.
     """
 
-    unreachable: tuple[Unreachable, ...]
-    unprintable: tuple[Unprintable, ...]
+    unreachable: tuple[Unfilled, ...]
+    unprintable: tuple[Unfilled, ...]
     regions: tuple[PatchRegion, ...]
     columns: tuple[LeftColumns, ...]
 
@@ -126,7 +117,7 @@ def left_over(
     )
     left = np.where(done, np.minimum(left, state.sunk_mm), left)
     kinds = _kinds(state, model)
-    unreachable: list[Unreachable] = []
+    unreachable: list[Unfilled] = []
     lost = list(state.lost)
     regions: list[PatchRegion] = []
     for piece in model.deficit.decompose():
@@ -147,9 +138,9 @@ def left_over(
         ):
             cause_mm3 = volume_mm3 * (1.0 - share) * part
             if cause in (LeftCause.NO_BEAD, LeftCause.TOO_LONG):
-                lost.append(Unprintable(cause_mm3, box, reason))
+                lost.append(Unfilled(cause_mm3, box, reason))
             else:
-                unreachable.append(Unreachable(cause_mm3, box, reason + ended))
+                unreachable.append(Unfilled(cause_mm3, box, reason + ended))
     columns = _columns(state, model, kinds, left)
     return LeftOver(tuple(unreachable), tuple(lost), tuple(regions), columns)
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job_lines import runs_of
-from gcode.slicing.layer_plan import Unprintable
+from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.patch_beads import Chain, begun_inside, beside_runs, draw, weighed
 from gcode.slicing.patch_bridges import Bridges, Holds
 from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
@@ -111,7 +111,7 @@ class _Laying:
     laid_mm: Float[np.ndarray, "ny nx"]
     served: float
     height_mm: float
-    lost: list[Unprintable]
+    lost: list[Unfilled]
 
 
 def _after(
@@ -309,8 +309,8 @@ def _along_skin(
     return sorted(upward, key=lambda c: float(c.z_mm[0])), laid
 
 
-def _thin(region: Any, z_mm: float, height_mm: float, volume_mm3: float) -> Unprintable:
+def _thin(region: Any, z_mm: float, height_mm: float, volume_mm3: float) -> Unfilled:
     x0, y0, x1, y1 = region.bounds()
-    return Unprintable(
+    return Unfilled(
         float(volume_mm3), (x0, y0, z_mm - height_mm, x1, y1, z_mm), "thinner than half a nozzle"
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gcode.slicing.layer_plan import Unprintable
+from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.patch_model import PatchModel
 
 SAME_TIP_MM = 0.02  # passes nearer to each other lie beside, not on, each other
@@ -49,7 +49,7 @@ class PatchState:
     loose: Bool[np.ndarray, "ny nx"]
     hung_mm: Float[np.ndarray, "ny nx"]
     too_long_mm: Float[np.ndarray, "ny nx"]
-    lost: tuple[Unprintable, ...] = ()
+    lost: tuple[Unfilled, ...] = ()
 
     @classmethod
     def begun(cls, model: PatchModel) -> PatchState:

@@ -264,16 +264,13 @@ class HeightField:
         *,
         cell_mm: float | None = None,
         origin_mm: tuple[float, float] | None = None,
-        unseen_z_mm: float | None = None,
     ) -> HeightField:
-        """Read what `write` writes.
+        """Read what `write` writes; cells that are no number are as high as the highest seen.
 
         Parameters
         ----------
         cell_mm, origin_mm
             Placement for files that carry none (`.npy`, plain TIFF); origin defaults to 0, 0.
-        unseen_z_mm
-            Height for NaN cells; by default the highest seen cell (unseen is solid).
 
         Raises
         ------
@@ -304,7 +301,7 @@ class HeightField:
             raise InputError(f"{path}: it has heights {z_mm.shape} and says of {seen.shape}, seen.")
         if not finite.any():
             raise InputError(f"{path}: the height map holds no finite height.")
-        solid_mm = float(z_mm[finite].max()) if unseen_z_mm is None else unseen_z_mm
+        solid_mm = float(z_mm[finite].max())  # unseen is solid
         return cls(
             origin_mm=origin,
             cell_mm=cell,
