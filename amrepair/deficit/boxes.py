@@ -67,7 +67,7 @@ class Sought:
         """(p, 3) places that are known to be missing: some surfels, surface, lines of the job."""
         told = [self.evidence.surfels.place_mm[inside], self.surface_mm]
         if self.gone is not None:
-            told.append(self.gone.samples_mm(self.options.skipped.look_step_mm))
+            told.append(self.gone.samples_mm(self.options.skipped.sample_step_mm))
         return np.concatenate(told)
 
     def nearest_is_labelled(self, samples_mm: Points) -> Mask:

@@ -159,7 +159,7 @@ def compute_deficit(
     template = anomaly.expected(template)
     evidence, lines = _evidence_of(scan, template, anomaly, beads, options.skipped)
     deviation_mm = anomaly.deviation_mm
-    look = as_built.seen if as_built is not None else partial(
+    see = as_built.seen if as_built is not None else partial(
         as_built_heights, scan, template, evidence.spacing_mm, images=evidence.images,
         build_from_template=build_from_template, printed_z_mm=printed_z_mm,
         options=options.heights,
@@ -170,7 +170,7 @@ def compute_deficit(
     ]
     with ThreadPoolExecutor(1) as beside:  # heights of the scan wait for no solid
         many = _roughly_missing(anomaly, evidence) > options.early_mm3
-        early = beside.submit(look) if many else None
+        early = beside.submit(see) if many else None
         solids = [pieces_of(each, progress) for each in sought]
     regions = [
         _region(piece, each, build_from_template)
@@ -180,7 +180,7 @@ def compute_deficit(
     missing, excess = (_in_build_frame(pieces, build_from_template) for pieces in solids)
 
     def stands() -> HeightField:
-        seen = look() if early is None else early.result()
+        seen = see() if early is None else early.result()
         if as_built is not None:
             return as_built.standing(seen, missing)
         parts = missing, excess
@@ -217,7 +217,7 @@ def _evidence_of(
     if not len(lines.width_mm):
         return evidence, None
     labelled = np.asarray(anomaly.surfel_label) != int(Label.OK)
-    about = with_stubs(evidence, lines.samples_mm(options.look_step_mm), labelled)
+    about = with_stubs(evidence, lines.samples_mm(options.sample_step_mm), labelled)
     return about, lines
 
 

@@ -21,7 +21,7 @@ from amrepair.loop.layer_level import LayerLevel
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Finding, judge
-from amrepair.policy.worth import defect_volumes
+from amrepair.policy.worth import Piece, defect_volumes
 from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals
@@ -206,13 +206,7 @@ def _whole_defects(regions: Sequence[Region], policy: PolicyOptions = USUAL_POLI
     whole_mm3 = np.zeros(len(regions))
     for label in Label:
         mine = [k for k, region in enumerate(regions) if region.label is label]
-        boxes = [np.asarray(regions[k].box_mm) for k in mine]
-        whole_mm3[mine] = defect_volumes(
-            boxes,
-            [regions[k].volume_mm3 for k in mine],
-            [regions[k].skipped for k in mine],
-            policy,
-        )
+        whole_mm3[mine] = defect_volumes([Piece.of(regions[k]) for k in mine], policy)
     return whole_mm3
 
 

@@ -16,8 +16,8 @@ class SkippedOptions:
 
     Attributes
     ----------
-    look_step_mm, looks_together
-        Looks along a line, and so many of them are judged together.
+    sample_step_mm, samples_together
+        Samples along a line, and so many of them are judged together.
     least_stretch_mm
         Shorter stretches are seams and corners.
     joined_mm, straight_on
@@ -50,7 +50,7 @@ class SkippedOptions:
         Of a line's width: a ray that meets it so near to its middle ends there.
     held_places, alike, there_of_alike
         Places across a line that rest on the layer below or not. How low a line over a rim lies, so
-        many looks at lines held alike tell, of which so many are taken to be there: 50 mm of them.
+        many samples of lines held alike tell, of which so many are taken to be there: over 50 mm.
     held_share
         Of a line's width: with less over what lies below a line hangs; walls that lean are held
         by a sixth.
@@ -61,8 +61,8 @@ class SkippedOptions:
         off: of their depths this quantile, as of lines that are gone the floor lies deeper.
     """
 
-    look_step_mm: float = 0.25
-    looks_together: int = 5
+    sample_step_mm: float = 0.25
+    samples_together: int = 5
     least_stretch_mm: float = 1.5
     joined_mm: float = 1e-3
     straight_on: float = 0.7

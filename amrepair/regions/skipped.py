@@ -1,7 +1,7 @@
 """Skipped beads: stretches of the job's own lines where rays say that no plastic is.
 
 A line one bead wide beside a wall lies so near to the template's surface that no distance to it
-tells that it is gone; along the line, looks at its own middle do. What follows is for the deficit.
+tells that it is gone; samples along the line's own middle do. What follows is for the deficit.
 """
 
 from __future__ import annotations
@@ -120,18 +120,18 @@ def skipped(
     """
     paths = _Paths.of(beads, options)
     lines, line = paths.lines, paths.line
-    planned, together = _Looks.planned(paths), 0
+    planned, together = _Samples.planned(paths), 0
     if evidence.has_rays and len(line):
         together = _enough_together(paths, planned, scan, over_mm, options)
     if not together:
         return lines.some(np.zeros(len(lines.width_mm), dtype=bool))
     # the emptiest of all rays cost little; only where they say "open" all of them are asked
     ask = np.flatnonzero(evidence.rays_say(planned.middle_mm) > 0)
-    looks = planned.some(ask).as_laid(beads, evidence, template, options)
-    ask, looks = ask[looks.rays_mm > 0], looks.some(looks.rays_mm > 0)
+    samples = planned.some(ask).as_laid(beads, evidence, template, options)
+    ask, samples = ask[samples.rays_mm > 0], samples.some(samples.rays_mm > 0)
     opens = np.full(len(line), -1.0)
-    opens[ask] = _by_views(looks, planned, scan, template, options)
-    less = max(together // 2, options.looks_together)  # over which it must be the surer
+    opens[ask] = _by_views(samples, planned, scan, template, options)
+    less = max(together // 2, options.samples_together)  # over which it must be the surer
     whole, part = (_together(opens, paths.path, count) for count in (together, less))
     share = options.gone_erring if over_mm else options.gone_share
     gone = (whole >= share) | (part >= options.sure_share)
@@ -160,8 +160,8 @@ class _Paths:
     ends_mm
         (n + 1,) length of all lines before each, and of all.
     path, at_mm, step_mm, line, share
-        (m,) looks along the paths: the path, how far along all lines, the distance between two, the
-        line, and where on it from 0 to 1.
+        (m,) samples along the paths: the path, how far along all lines, the distance between two,
+        the line, and where on it from 0 to 1.
     """
 
     lines: PlannedBeads
@@ -174,7 +174,7 @@ class _Paths:
 
     @classmethod
     def of(cls, beads: PlannedBeads, options: SkippedOptions) -> _Paths:
-        """Paths of beads in the order in which they are laid, looked at step by step."""
+        """Paths of beads in the order in which they are laid, sampled step by step."""
         over = beads.end_mm - beads.start_mm
         length_mm = np.linalg.norm(over, axis=1)
         begins = np.ones(len(length_mm), dtype=bool)
@@ -190,7 +190,7 @@ class _Paths:
         ends_mm = np.concatenate([[0.0], np.cumsum(length_mm)])
         first = np.searchsorted(path, np.arange(path.max(initial=-1) + 1))
         path_mm = np.bincount(path, length_mm)
-        count = np.ceil(path_mm / options.look_step_mm).astype(np.int64)
+        count = np.ceil(path_mm / options.sample_step_mm).astype(np.int64)
         of, number = in_turn(count)
         step_mm = (path_mm / np.maximum(count, 1))[of]
         at_mm = ends_mm[first[of]] + (number + 0.5) * step_mm
@@ -200,7 +200,7 @@ class _Paths:
 
     @property
     def middles_mm(self) -> Points:
-        """(m, 3) middles of the lines where the looks are."""
+        """(m, 3) middles of the lines where the samples are."""
         lines, line = self.lines, self.line
         over_mm = (lines.end_mm - lines.start_mm)[line]
         middle_mm = lines.start_mm[line] + self.share[:, None] * over_mm
@@ -208,7 +208,7 @@ class _Paths:
         return middle_mm
 
     def kept(self, gone: Mask, least_mm: Values) -> Mask:
-        """Neighbouring looks that say so, over a length."""
+        """Neighbouring samples that say so, over a length."""
         a, b = self._runs(gone, self.path)
         long = (b - a + 1) * self.step_mm[a] >= least_mm[a]
         found = np.zeros(len(gone), dtype=bool)
@@ -217,14 +217,14 @@ class _Paths:
         return found
 
     def grown(self, kept: Mask, gone: Values, options: SkippedOptions) -> Mask:
-        """Stretches go on, round corners too, as long as the next looks on the whole say so.
+        """Stretches go on, round corners too, as long as the next samples on the whole say so.
 
         `gone` is above 0 where less than half of a bead is there. Where a stretch is known to have
         slipped that is enough; nothing begins by it.
         """
         apart_mm = np.abs(self.lines.start_mm[1:] - self.lines.end_mm[:-1]).max(axis=1)
         chain = np.concatenate([[0], np.cumsum(apart_mm >= options.joined_mm)])[self.line]
-        open_on = kept | (_best_mean(gone, chain, options.looks_together) > 0)
+        open_on = kept | (_best_mean(gone, chain, options.samples_together) > 0)
         found = np.zeros_like(kept)
         for a, b in zip(*self._runs(open_on, chain), strict=True):
             mine = np.arange(a, b + 1)
@@ -235,14 +235,14 @@ class _Paths:
 
     @staticmethod
     def _runs(pick: Mask, of: Numbers) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
-        """First and last of neighbouring looks that are picked, of one path or chain."""
+        """First and last of neighbouring samples that are picked, of one path or chain."""
         at = np.flatnonzero(pick)
         begins = np.ones(len(at), dtype=bool)
         begins[1:] = (np.diff(at) > 1) | (np.diff(of[at]) != 0)
         return at[begins], at[np.roll(begins, -1)]  # one ends where the next begins
 
     def stretches(self, gone: Mask) -> PlannedBeads:
-        """Neighbouring looks that say so, as one bead for each line of theirs."""
+        """Neighbouring samples that say so, as one bead for each line of theirs."""
         a, b = self._runs(gone, self.path)
         from_mm, to_mm = (
             self.at_mm[k] + sign * self.step_mm[k] for k, sign in ((a, -0.5), (b, 0.5))
@@ -264,7 +264,7 @@ class _Paths:
 
 
 @dataclass(frozen=True, slots=True)
-class _Looks:
+class _Samples:
     """Looks at lines of which rays say that they are open.
 
     Attributes
@@ -290,7 +290,7 @@ class _Looks:
     strays: Mask
 
     @classmethod
-    def planned(cls, paths: _Paths) -> _Looks:
+    def planned(cls, paths: _Paths) -> _Samples:
         """Those along paths, as the job has them: of rays nothing is known yet."""
         lines, line = paths.lines, paths.line
         half_mm, width_mm = 0.5 * lines.height_mm[line], lines.width_mm[line]
@@ -302,7 +302,7 @@ class _Looks:
 
     def as_laid(
         self, beads: PlannedBeads, evidence: Evidence, template: Template, options: SkippedOptions
-    ) -> _Looks:
+    ) -> _Samples:
         """Where walls stand and lines on strands lie, and what rays say there."""
         middle_mm, sunk_mm = self.middle_mm, self.sunk_mm
         if len(middle_mm):
@@ -315,9 +315,9 @@ class _Looks:
         rays_mm = evidence.rays_say(middle_mm)
         return replace(self, middle_mm=middle_mm, sunk_mm=sunk_mm, rays_mm=rays_mm)
 
-    def some(self, which: Mask | Int[np.ndarray, " q"]) -> _Looks:
+    def some(self, which: Mask | Int[np.ndarray, " q"]) -> _Samples:
         """Some of them."""
-        return _Looks(*(getattr(self, each.name)[which] for each in fields(self)))
+        return _Samples(*(getattr(self, each.name)[which] for each in fields(self)))
 
     def held(self, template: Template, options: SkippedOptions) -> Numbers:
         """(k,) of so many places across each line how many rest on the layer below.
@@ -338,7 +338,7 @@ class _Looks:
 def _wall_shift(
     middle_mm: Points, evidence: Evidence, template: Template, options: SkippedOptions
 ) -> Points:
-    """How much farther in than planned the walls at each look stand.
+    """How much farther in than planned the walls at each sample stand.
 
     A part that has shrunk, or is laid a little aside, shows each wall farther in: its outermost
     lines are there, that much farther in too. The wall below tells; a line that is gone does not
@@ -439,7 +439,7 @@ class _Hanging:
         A line that sticks out of the layer below rests on it by the rest of its width, however far
         the one below that is from reaching there: walls that lean, and what closes over a hole.
         """
-        place_mm, which = places_to_ends(beads.start_mm, beads.end_mm, options.look_step_mm)
+        place_mm, which = places_to_ends(beads.start_mm, beads.end_mm, options.sample_step_mm)
         reach_mm = options.sunk_reach_mm + float(beads.width_mm.max(initial=0.0))
         near = has_near(place_mm * FROM_ABOVE, top_mm * FROM_ABOVE, reach_mm)
         place_mm, which = place_mm[near], which[near]
@@ -480,7 +480,7 @@ def _sunk_mm(
     evidence: Evidence,
     options: SkippedOptions,
 ) -> Values:
-    """How much lower than its layer each look's line lies because it was laid on strands.
+    """How much lower than its layer each sample's line lies because it was laid on strands.
 
     What hangs is round: of its plastic some lies below its layer, and what is laid on it fills
     the grooves between strands first. So the layers over a bridge or over lettering are all lower,
@@ -511,27 +511,27 @@ def _sunk_mm(
 
 
 def _by_views(
-    looks: _Looks, planned: _Looks, scan: Scan, template: Template, options: SkippedOptions
+    samples: _Samples, planned: _Samples, scan: Scan, template: Template, options: SkippedOptions
 ) -> Values:
     """(k,) how open a line is by all views, each once, in halves of a line.
 
     A scanner that errs does so view by view: one that sees a line gone is outvoted. What nobody
     looked into is there, and a view that does not see it takes half of it to be.
     """
-    met, deep, came = _met(looks, scan, options)
-    sag = _sag(looks, planned, scan, template, options)
+    met, deep, came = _met(samples, scan, options)
+    sag = _sag(samples, planned, scan, template, options)
     assert scan.sensor_index is not None
     open_by = np.clip(2.0 * (deep - sag[met]), -1.0, 1.0)
     return _each_view_once(open_by, met, scan.sensor_index[came], len(sag))
 
 
 def _each_view_once(
-    value: Values, met: Numbers, view: Int[np.ndarray, " n"], looks: int
+    value: Values, met: Numbers, view: Int[np.ndarray, " n"], samples: int
 ) -> Float[np.ndarray, " k"]:
-    """(k,) mean of the means of the views, of which so many see a look as of most; −1 of none."""
+    """(k,) mean of the means of the views, of which so many see a sample as of most; −1 of none."""
     views = int(view.max(initial=0)) + 1
-    seen = np.bincount(met * views + view, minlength=looks * views).reshape(looks, views)
-    total = np.bincount(met * views + view, value, looks * views).reshape(looks, views)
+    seen = np.bincount(met * views + view, minlength=samples * views).reshape(samples, views)
+    total = np.bincount(met * views + view, value, samples * views).reshape(samples, views)
     count = (seen > 0).sum(axis=1)
     usual = float(np.median(count[count > 0])) if len(met) else 1.0
     mean = (total / np.maximum(seen, 1)).sum(axis=1) / np.maximum(count, usual)
@@ -539,15 +539,15 @@ def _each_view_once(
 
 
 def _enough_together(
-    paths: _Paths, planned: _Looks, scan: Scan, over_mm: float, options: SkippedOptions
+    paths: _Paths, planned: _Samples, scan: Scan, over_mm: float, options: SkippedOptions
 ) -> int:
-    """So many looks that no stretch of the highest lines lies so much too high as one gone too low.
+    """So many samples that no stretch of the top lines is as much too high as a gone one too low.
 
     At least over a length; 0 where that is not to be had. A scanner's errors are both, and no line
     that is gone lies too high.
     """
     if not over_mm:
-        return options.looks_together
+        return options.samples_together
     if not np.isfinite(over_mm):
         return 0
     high_mm = planned.middle_mm[:, 2]
@@ -556,8 +556,8 @@ def _enough_together(
     assert scan.sensor_index is not None
     closed = np.clip(-2.0 * (deep + 1.0), -1.0, 1.0)
     closes = _each_view_once(closed, met, scan.sensor_index[came], len(which))
-    together = int(np.ceil(max(over_mm, options.errs_along_mm) / options.look_step_mm))
-    while together * options.look_step_mm <= options.most_together_mm:
+    together = int(np.ceil(max(over_mm, options.errs_along_mm) / options.sample_step_mm))
+    while together * options.sample_step_mm <= options.most_together_mm:
         whole, part = (
             _best_mean(closes, paths.path[which], count).max()
             for count in (together, together // 2)
@@ -569,7 +569,7 @@ def _enough_together(
 
 
 def _sag(
-    looks: _Looks, planned: _Looks, scan: Scan, template: Template, options: SkippedOptions
+    samples: _Samples, planned: _Samples, scan: Scan, template: Template, options: SkippedOptions
 ) -> Values:
     """(k,) how much lower than planned each line lies if it is there, in heights of a line.
 
@@ -578,13 +578,13 @@ def _sag(
     what is below, as in walls that lean and in cubic infill, spreads over it: how low it lies then,
     lines about that are held alike tell, of which so many are there.
     """
-    held = looks.held(template, options)
-    sag = np.where((held == 0) | looks.strays, 1.0, 0.0)
-    rim = (held > 0) & (held < options.held_places) & ~looks.strays
+    held = samples.held(template, options)
+    sag = np.where((held == 0) | samples.strays, 1.0, 0.0)
+    rim = (held > 0) & (held < options.held_places) & ~samples.strays
     if not rim.any():
         return sag
     alike = planned.held(template, options)
-    z_mm, other_mm = (np.round(each.middle_mm[:, 2], 6) for each in (looks, planned))
+    z_mm, other_mm = (np.round(each.middle_mm[:, 2], 6) for each in (samples, planned))
     for high_mm, held_by in np.unique(np.column_stack([z_mm, held])[rim], axis=0):
         mine = np.flatnonzero((z_mm == high_mm) & (held == held_by))
         others = planned.some((other_mm == high_mm) & (alike == held_by))
@@ -595,27 +595,27 @@ def _sag(
             continue
         lies = 0.5 + deep[order][first + count // 2]
         near = cKDTree(others.middle_mm[which, :2]).query(
-            looks.middle_mm[mine, :2], k=np.arange(1, min(len(which), options.alike) + 1)
+            samples.middle_mm[mine, :2], k=np.arange(1, min(len(which), options.alike) + 1)
         )[1]
         sag[mine] = np.clip(np.quantile(lies[near], options.there_of_alike, axis=1), 0.0, 1.0)
     return sag
 
 
-def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, Values, Numbers]:
-    """(r,) looks whose lines' cores rays met, how deep below the middle each ended, and which.
+def _met(samples: _Samples, scan: Scan, options: SkippedOptions) -> tuple[Numbers, Values, Numbers]:
+    """(r,) samples whose lines' cores rays met, how deep below the middle each ended, and which.
 
     In heights of a line. A ray counts where it crosses the height of the line's middle, however far
     aside the floor lies that it saw: between strands that hang apart slanting rays see all of what
     is under them.
     """
-    core_mm = options.under_share * looks.width_mm
-    reach_mm = float(np.hypot(core_mm.max(initial=0.0), 0.5 * options.look_step_mm))
-    height_mm = np.round(looks.middle_mm[:, 2], 6)
+    core_mm = options.under_share * samples.width_mm
+    reach_mm = float(np.hypot(core_mm.max(initial=0.0), 0.5 * options.sample_step_mm))
+    height_mm = np.round(samples.middle_mm[:, 2], 6)
     none = np.zeros(0, np.int64)
     found: list[tuple[Numbers, Values, Numbers]] = [(none, np.zeros(0), none)]
     for z_mm in np.unique(height_mm):
         mine = np.flatnonzero(height_mm == z_mm)
-        place_mm, thick_mm = looks.middle_mm[mine], 2.0 * looks.half_mm[mine]
+        place_mm, thick_mm = samples.middle_mm[mine], 2.0 * samples.half_mm[mine]
         came, crossing_mm = rays_crossing(
             scan, place_mm[:, :2], reach_mm, z_mm, z_mm + options.errs_over * float(thick_mm.max())
         )
@@ -623,7 +623,7 @@ def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, V
         met = near < len(mine)
         near, crossing_mm, points_mm = near[met], crossing_mm[met], scan.points_mm[came[met]]
         off_mm = crossing_mm - place_mm[near, :2]
-        x, y = looks.along[mine[near]].T
+        x, y = samples.along[mine[near]].T
         deep = (z_mm - points_mm[:, 2]) / thick_mm[near]
         in_core = np.abs(off_mm[:, 0] * y - off_mm[:, 1] * x) < core_mm[mine[near]]
         in_core &= deep >= -options.errs_over
@@ -633,7 +633,7 @@ def _met(looks: _Looks, scan: Scan, options: SkippedOptions) -> tuple[Numbers, V
 
 
 def _together(value: Values, path: Numbers, together: int) -> Values:
-    """(m,) `_best_mean` where a look says "gone" itself: an end that is there does not belong."""
+    """(m,) `_best_mean` where a sample says "gone" itself: an end that is there does not belong."""
     return np.where(value > 0, _best_mean(value, path, together), -np.inf)
 
 

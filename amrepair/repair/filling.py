@@ -26,8 +26,11 @@ def fillable(
     regions = [region for region in deficit.regions if region.label is Label.MISSING]
     known = [region.box_mm for region in regions]
     of_piece = [regions[nearest_box(known, box)] if regions else None for box in boxes]
-    lines = [region is not None and region.skipped for region in of_piece]
-    keep = worth.worth_mending(boxes, [piece.volume() for piece in pieces], lines, policy)
+    weighed = [
+        worth.Piece(box, piece.volume(), skipped=region is not None and region.skipped)
+        for box, piece, region in zip(boxes, pieces, of_piece, strict=True)
+    ]
+    keep = worth.worth_mending(weighed, policy)
     filled = [
         piece
         for piece, region, kept in zip(pieces, of_piece, keep, strict=True)

@@ -1,4 +1,4 @@
-"""The lines that bring a cold machine to where a job's nozzle is, over what stands on the bed.
+"""A job gone on with over what stands on the bed: a cold machine brought to where its nozzle is.
 
 Z is never homed. It lifts, homes X and Y above everything, heats, primes beside the part, comes
 straight down, and says again what the job had set.
@@ -7,18 +7,20 @@ straight down, and says again what the job had set.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
 
-from gcode.dialects import dialect_of, fan_command, number
+from gcode.check import CheckedProgram, check, policy_of
+from gcode.dialects import dialect_of, fan_command, heaters_off, number
 from gcode.errors import InputError
-from gcode.moves import ModalState
+from gcode.moves import ModalState, Program
 from gcode.profiles import PrinterProfile, PrintSetup
+from gcode.progress import Progress
 from gcode.reader import Job
-from gcode.resumption.settings import Settings
+from gcode.resumption.settings import Settings, settings_before
 from gcode.slicing.room import bare_place, room_for_line
 from gcode.surfaces import HeightField
 from gcode.units import filament_area_mm2, mm_min_from_mm_s
@@ -29,7 +31,74 @@ LEAST_LIFT_MM = 2.0
 PRIME_MM3_S = 4.0
 
 
-def prime(head: Head, field: HeightField, printer: PrinterProfile) -> str:
+@dataclass(frozen=True, slots=True)
+class Continued:
+    """A checked program that goes on with a job.
+
+    Attributes
+    ----------
+    hotend_c
+        Of the head that prints first.
+    primed
+        `on the bed`, or `in the air` where the head does not fit beside the part.
+    """
+
+    checked: CheckedProgram
+    hotend_c: float
+    bed_c: float
+    primed: str
+
+
+def continued(
+    job: Job,
+    line: int,
+    body: Sequence[str],
+    setup: PrintSetup,
+    *,
+    state: ModalState,
+    standing: HeightField,
+    reach: HeightField,
+    about: Sequence[str],
+    progress: Progress,
+) -> Continued:
+    """Bring a cold machine to where a job's nozzle is before a line, and go on from there.
+
+    Parameters
+    ----------
+    body
+        What is printed then: the job's lines from `line` on, perhaps changed.
+    state
+        The machine's before them.
+    standing, reach
+        What stands on the bed; the same on all of the nozzle's reach, where there is to be room to
+        prime.
+    about
+        Comments at the program's head.
+
+    Raises
+    ------
+    InputError, CheckRefusedError
+        If there is no room to lift, home or prime; if what would be printed is refused.
+    """
+    printer, settings = setup.printer, settings_before(job, line)
+    hotends_c, bed_c = _temperatures(settings, setup)
+    head = Head(setup, state, clear_mm=height_over(standing.top_mm, state, printer))
+    told = "Z is not homed: the printer has been on all the time, or has been told its Z anew"
+    head.comment(*about, told)
+    head.lift_and_home(settings)
+    head.heat(hotends_c, bed_c)
+    primed = _prime(head, reach, printer)
+    head.come_down(pulled_back_mm(job, line))
+    head.restore(settings)
+    off = heaters_off(job.program.dialect, printer.nozzles)
+    program = Program("\n".join([*head.lines, *body, *off]) + "\n", job.program.dialect)
+    checked = check(
+        program, setup, as_built=standing, policy=policy_of(job.program), progress=progress
+    )
+    return Continued(checked, hotends_c[state.heater], bed_c, primed)
+
+
+def _prime(head: Head, field: HeightField, printer: PrinterProfile) -> str:
     """Prime where there is room; says where that was."""
     place = room_for_line(field, printer, head.prime_length_mm)
     if place is not None:
@@ -45,7 +114,7 @@ def prime(head: Head, field: HeightField, printer: PrinterProfile) -> str:
     return "in the air"
 
 
-def temperatures(settings: Settings, setup: PrintSetup) -> tuple[tuple[float, ...], float]:
+def _temperatures(settings: Settings, setup: PrintSetup) -> tuple[tuple[float, ...], float]:
     """The job's own, of each head and the bed; the material's where a macro keeps them secret."""
     hotends_c = (setup.material.hotend_c if c is None else c for c in settings.hotends_c)
     bed_c = setup.material.bed_c if settings.bed_c is None else settings.bed_c

@@ -11,15 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gcode.check import CheckedProgram, check, policy_of
-from gcode.dialects import command_of, heaters_off, number
+from gcode.dialects import command_of, number
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job, job_for
-from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
-from gcode.resumption.settings import settings_before
+from gcode.resumption.head import Continued, continued
 from gcode.resumption.standing import over_reach
 from gcode.stretches import places_along
 from gcode.surfaces import HeightField
@@ -32,7 +30,7 @@ _Z = re.compile(r"([Zz])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 
 
 @dataclass(frozen=True, slots=True)
-class Stacked:
+class Stacked(Continued):
     """A checked program that prints a job onto a part.
 
     Attributes
@@ -43,12 +41,8 @@ class Stacked:
         How far what is under its first layer lies below that height, at most where it is held.
     """
 
-    checked: CheckedProgram
     raised_mm: float
     uneven_mm: float
-    hotend_c: float
-    bed_c: float
-    primed: str
 
 
 def print_onto(
@@ -78,27 +72,16 @@ def print_onto(
     job = job_for(program, setup.printer, progress)
     raised_mm, uneven_mm = _height_under(job, standing)
     line = job.layers[0].first_line
-    state, settings = job.state_after(line), settings_before(job, line)
+    state = job.state_after(line)
     x, y, z = state.position_mm
-    state = replace(state, position_mm=(x, y, z + raised_mm))
-    hotends_c, bed_c = temperatures(settings, setup)
-    head = Head(setup, state, clear_mm=height_over(standing.top_mm, state, setup.printer))
-    head.comment(
-        f"{title}, raised by {raised_mm:g} mm onto what stands there",
-        "Z is not homed: the printer has been on all the time, or has been told its Z anew",
-    )
-    head.lift_and_home(settings)
-    head.heat(hotends_c, bed_c)
-    primed = prime(head, over_reach(standing, setup.printer), setup.printer)
-    head.come_down(pulled_back_mm(job, line))
-    head.restore(settings)
     lines = program.text.rstrip().split("\n")[line:]
-    body = _raised(lines, raised_mm, absolute=state.absolute_xyz, first=line)
-    off = heaters_off(program.dialect, setup.printer.nozzles)
-    text = "\n".join([*head.lines, *body, *off]) + "\n"
-    whole = Program(text, program.dialect)
-    checked = check(whole, setup, as_built=standing, policy=policy_of(program), progress=progress)
-    return Stacked(checked, raised_mm, uneven_mm, hotends_c[state.heater], bed_c, primed)
+    made = continued(
+        job, line, _raised(lines, raised_mm, absolute=state.absolute_xyz, first=line), setup,
+        state=replace(state, position_mm=(x, y, z + raised_mm)),
+        standing=standing, reach=over_reach(standing, setup.printer),
+        about=[f"{title}, raised by {raised_mm:g} mm onto what stands there"], progress=progress,
+    )  # fmt: skip
+    return Stacked(made.checked, made.hotend_c, made.bed_c, made.primed, raised_mm, uneven_mm)
 
 
 def _height_under(job: Job, standing: HeightField) -> tuple[float, float]:

@@ -12,17 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from gcode.check import CheckedProgram, check, policy_of
-from gcode.dialects import heaters_off
 from gcode.errors import InputError
 from gcode.moves import Program
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.reader import Job, job_for
 from gcode.reader.job import JobLayer
-from gcode.resumption.head import Head, height_over, prime, pulled_back_mm, temperatures
+from gcode.resumption.head import Continued, continued
 from gcode.resumption.leaving_out import lines_without
-from gcode.resumption.settings import settings_before
 from gcode.resumption.standing import standing_field
 from gcode.surfaces import HeightField
 
@@ -31,8 +28,8 @@ SAME_LAYER = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Resumption:
-    """A checked program that goes on with a job.
+class Resumption(Continued):
+    """A checked program that goes on with a job from a layer on.
 
     Attributes
     ----------
@@ -42,17 +39,11 @@ class Resumption:
         The job's line that the program goes on with, from 0.
     standing
         What must stand on the bed already.
-    primed
-        `on the bed`, or `in the air` where the head does not fit beside the part.
     """
 
-    checked: CheckedProgram
     standing: HeightField
     layer: JobLayer
     first_line: int
-    hotend_c: float
-    bed_c: float
-    primed: str
 
 
 def resume_at(
@@ -89,36 +80,20 @@ def resume_at(
     progress("what stands", 0.0, 1.0)
     first = first_layer(job, z_mm, layer)
     line = first.first_line
-    state, settings = job.state_after(line), settings_before(job, line)
     field = standing_field(job.beads, line, setup.printer)
     progress("what stands", 1.0, 1.0)
-    hotends_c, bed_c = temperatures(settings, setup)
-    head = Head(setup, state, clear_mm=height_over(field.top_mm, state, setup.printer))
-    head.comment(
-        f"{title}, from layer {first.index} on, whose top is at {first.z_mm:g} mm",
-        f"up to {field.top_mm:g} mm the part stands there already",
-        "Z is not homed: the printer has been on all the time, or has been told its Z anew",
-    )
-    head.lift_and_home(settings)
-    head.heat(hotends_c, bed_c)
-    primed = prime(head, field, setup.printer)
-    head.come_down(pulled_back_mm(job, line))
-    head.restore(settings)
     body: Sequence[str] = program.text.rstrip().split("\n")[line:]
     if without is not None:
         body = lines_without(job, line, without, setup.printer)
-    off = heaters_off(program.dialect, setup.printer.nozzles)
-    text = "\n".join([*head.lines, *body, *off]) + "\n"
-    whole = Program(text, program.dialect)
-    return Resumption(
-        checked=check(whole, setup, as_built=field, policy=policy_of(program), progress=progress),
-        standing=field,
-        layer=first,
-        first_line=line,
-        hotend_c=hotends_c[state.heater],
-        bed_c=bed_c,
-        primed=primed,
-    )
+    made = continued(
+        job, line, body, setup, state=job.state_after(line), standing=field, reach=field,
+        about=[
+            f"{title}, from layer {first.index} on, whose top is at {first.z_mm:g} mm",
+            f"up to {field.top_mm:g} mm the part stands there already",
+        ],
+        progress=progress,
+    )  # fmt: skip
+    return Resumption(made.checked, made.hotend_c, made.bed_c, made.primed, field, first, line)
 
 
 def first_layer(job: Job, z_mm: float | None, index: int | None) -> JobLayer:

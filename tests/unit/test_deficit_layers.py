@@ -10,7 +10,7 @@ import trimesh
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY
-from amrepair.policy.worth import worth_mending
+from amrepair.policy.worth import Piece, worth_mending
 from amrepair.regions import detect
 from amrepair.scans import ScanRequest
 from amrepair.simulate.parameters import load_world
@@ -120,20 +120,24 @@ def test_a_layer_as_it_should_be_lacks_nothing(template: MeshSdf, seed: int) -> 
 
 
 def test_pieces_side_by_side_are_one_defect_and_crumbs_join_nothing() -> None:
-    def box(x_mm: float) -> np.ndarray:
-        return np.array([[x_mm, 0.0, 0.0], [x_mm + 1.0, 1.0, 0.2]])
+    def piece(x_mm: float, volume_mm3: float) -> Piece:
+        box_mm = np.array([[x_mm, 0.0, 0.0], [x_mm + 1.0, 1.0, 0.2]])
+        return Piece(box_mm, volume_mm3, skipped=False)
 
     share = 0.4 * USUAL_POLICY.least_mm3
-    kept = worth_mending([box(0.0), box(1.5), box(3.0), box(20.0)], [share] * 4, [False] * 4)
+    kept = worth_mending([piece(x_mm, share) for x_mm in (0.0, 1.5, 3.0, 20.0)])
     assert kept.tolist() == [True, True, True, False]
-    assert not worth_mending([box(0.1 * k) for k in range(100)], [0.03] * 100, [False] * 100).any()
+    assert not worth_mending([piece(0.1 * k, 0.03) for k in range(100)]).any()
 
 
 def test_lines_gone_here_and_there_are_one_defect_and_a_rough_layer_is_none() -> None:
     # regression: four lines of 3.5 mm gone in as many tabs were not filled in their own layer;
     # eleven crumbs of a clean one (0.9 mm³ in all) nearly were
-    boxes = [np.array([[5.0 * k, 0.0, 0.0], [5.0 * k + 3.0, 0.4, 0.2]]) for k in range(11)]
+    def apart(volumes_mm3: list[float], *, skipped: bool) -> list[Piece]:
+        boxes = (np.array([[5.0 * k, 0.0, 0.0], [5.0 * k + 3.0, 0.4, 0.2]]) for k in range(11))
+        return [Piece(*each, skipped) for each in zip(boxes, volumes_mm3, strict=False)]
+
     tabs, rough = [0.33, 0.29, 0.18, 0.17], [0.14] * 11
-    assert worth_mending(boxes[:4], tabs, [True] * 4).all()
-    assert not worth_mending(boxes[:4], tabs, [False] * 4).any()
-    assert not worth_mending(boxes, rough, [True] * 11).any()
+    assert worth_mending(apart(tabs, skipped=True)).all()
+    assert not worth_mending(apart(tabs, skipped=False)).any()
+    assert not worth_mending(apart(rough, skipped=True)).any()

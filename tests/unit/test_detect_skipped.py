@@ -380,8 +380,8 @@ def gone_of(scan: Scan) -> PlannedBeads:
 
 
 @pytest.mark.parametrize("open_again", [False, True])
-def test_a_stretch_goes_on_round_a_corner_as_long_as_looks_say_open(open_again: bool) -> None:
-    # regression: round the corner of an inner wall, where looks on neither side are enough to say
+def test_a_stretch_goes_on_round_a_corner_as_long_as_samples_say_open(open_again: bool) -> None:
+    # regression: round the corner of an inner wall, where samples on neither side are enough to say
     # so, two layers kept a hole of 3.5 mm, whatever was gone before and after it
     start = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0], [20.0, 0.0, 1.0]])
     end = np.array([[10.0, 0.0, 1.0], [10.0, 8.0, 1.0], [30.0, 0.0, 1.0]])  # the last is apart
@@ -389,7 +389,7 @@ def test_a_stretch_goes_on_round_a_corner_as_long_as_looks_say_open(open_again: 
     paths = _Paths.of(lines, USUAL_SKIPPED)
     along_mm = paths.at_mm
     gone = np.where((along_mm > 6.0) & (along_mm < 14.0), 0.2, -1.0)
-    gone[np.argmin(np.abs(along_mm - 10.6))] = -0.1  # one look among others
+    gone[np.argmin(np.abs(along_mm - 10.6))] = -0.1  # one sample among others
     gone[along_mm > 18.0] = 0.2 if open_again else -1.0  # not joined: nothing was seen to begin
     kept = (along_mm > 6.5) & (along_mm < 8.2)
     grown = paths.grown(kept, gone, USUAL_SKIPPED)
