@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from amrepair.arrays import Box, Mask, Matrix, Points, Values, Vector
 from amrepair.errors import InputError
@@ -258,7 +259,13 @@ def diagonal(points_mm: Points) -> float:
     return float(np.linalg.norm(np.ptp(points_mm, axis=0)))
 
 
+def grid_points(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Any:
+    """(n, 3) every combination of values along three axes, those of the last changing first."""
+    return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
 def box_corners(bounds_mm: Box) -> Float[np.ndarray, "8 3"]:
     """(8, 3) corners of a box, given its lowest and its highest corner."""
-    grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray(bounds_mm[grid, np.arange(3)], dtype=np.float64)
+    return np.asarray(
+        bounds_mm[grid_points([0, 1], [0, 1], [0, 1]), np.arange(3)], dtype=np.float64
+    )

@@ -20,7 +20,7 @@ from amrepair.align import search_kernels as kernels
 from amrepair.align.options import USUAL_ALIGN, CoarseOptions, Effort
 from amrepair.align.thinning import Thinned
 from amrepair.arrays import Box, Matrix, Points, Vector, Voxels
-from amrepair.frames import nearest_rotation, rigid, rotation_of_quaternion
+from amrepair.frames import grid_points, nearest_rotation, rigid, rotation_of_quaternion
 from amrepair.template.port import Template
 
 # Roots of x⁴ = x + 4 and 2 (Alexa, eq. 5).
@@ -66,7 +66,7 @@ class CoarseField:
         origin = box[0] - margin_mm
         shape = np.ceil((size + 2 * margin_mm) / cell_mm).astype(int) + 1
         axes = [origin[a] + cell_mm * np.arange(shape[a]) for a in range(3)]
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        nodes = grid_points(*axes)
         values = template.distance(nodes).reshape(tuple(shape)).astype(np.float32)
         return cls(origin, cell_mm, values, box, options)
 

@@ -15,6 +15,7 @@ from amrepair.arrays import Points, VoxelMask, Voxels
 from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
 from amrepair.field.groups import connected
+from amrepair.frames import grid_points
 from gcode.solids import as_manifold, is_valid
 
 SURFACE_STEPS = 4.0  # of a grid: more than the longest way between corners of a cube
@@ -79,7 +80,7 @@ class VoxelBox:
     def samples_mm(self) -> Points:
         """(v, 3) all sample points, last axis fastest."""
         axes = [self.low_mm[i] + self.step_mm[i] * np.arange(self.shape[i]) for i in range(3)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        return grid_points(*axes)
 
     def distance_to(self, mask: VoxelMask) -> Voxels:
         """Distance of every sample to the nearest one in `mask`, mm; inf where it is empty."""

@@ -19,7 +19,7 @@ from amrepair.align.options import SearchRound
 from amrepair.align.search import spread_rotations
 from amrepair.align.search_kernels import peaks
 from amrepair.arrays import Matrix, Vector
-from amrepair.frames import moved, nearest_rotation, rigid
+from amrepair.frames import grid_points, moved, nearest_rotation, rigid
 from amrepair.merge import search_kernels as kernels
 from amrepair.merge.options import MatchOptions, MergeOptions
 from amrepair.merge.threads import in_threads
@@ -52,7 +52,7 @@ class FreeSpace:
         thin = view.thin.points_mm
         centre, cell_mm = 0.5 * (thin.min(axis=0) + thin.max(axis=0)), SIDE * size_mm / CELLS
         axis = (np.arange(CELLS) - 0.5 * (CELLS - 1)) * cell_mm
-        nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        nodes = grid_points(axis, axis, axis)
         free = view.looks.free(nodes + centre, 0.5 * cell_mm).reshape(CELLS, CELLS, CELLS)
         field = ndimage.distance_transform_edt(free) - ndimage.distance_transform_edt(~free)
         at = ((thin - centre) / cell_mm + 0.5 * (CELLS - 1)).T

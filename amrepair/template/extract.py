@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Faces, Vector, Vertices
 from amrepair.errors import TemplateError
+from amrepair.frames import grid_points
 from gcode.solids import as_manifold, is_valid
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def band_field(
             f"{MAX_EXTRACTED_CELLS:,}; choose a larger voxel"
         )
     edge_mm = BLOCK_CELLS * voxel_mm
-    block_index = np.stack(np.meshgrid(*map(np.arange, blocks), indexing="ij"), -1).reshape(-1, 3)
+    block_index = grid_points(*map(np.arange, blocks))
     centre = template.distance(low_mm + (block_index + 0.5) * edge_mm - 0.5 * voxel_mm) - level_mm
     far = np.copysign(np.float32(edge_mm), centre).astype(np.float32).reshape(blocks)
     field = np.empty(shape, dtype=np.float32)
@@ -111,7 +112,7 @@ def band_field(
     cells = field.reshape([n for count in blocks for n in (int(count), BLOCK_CELLS)])
     cells[:] = far[:, None, :, None, :, None]
     near = block_index[np.abs(centre) <= BAND_SAFETY * 0.5 * np.sqrt(3.0) * edge_mm]
-    inner = np.stack(np.meshgrid(*[np.arange(BLOCK_CELLS)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    inner = grid_points(*[np.arange(BLOCK_CELLS)] * 3)
     inner_mm = low_mm + inner * voxel_mm
     for first in range(0, len(near), BLOCKS_AT_ONCE):
         some = near[first : first + BLOCKS_AT_ONCE]

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from amrepair.arrays import Points, Values, Vector, Voxels
+from amrepair.frames import grid_points
 from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.grid_kernels import NOBODY, carry, near_triangles, shared_nodes
 from amrepair.template.mesh_sdf import MeshSdf
@@ -158,7 +159,7 @@ def _blocks(
 ) -> Float[np.ndarray, "b r r r"]:
     """(b, r+1, r+1, r+1) exact distances; nodes that blocks share are asked once."""
     fine = options.fine
-    inner = np.stack(np.meshgrid(*[np.arange(fine + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    inner = grid_points(*[np.arange(fine + 1)] * 3)
     block_of = np.full(bare.block_of.shape, -1, np.int64)
     block_of[tuple(cells.T)] = np.arange(len(cells))
     back, first = shared_nodes(cells, block_of, fine)

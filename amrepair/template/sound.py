@@ -24,7 +24,7 @@ from scipy.special import digamma, ndtr, polygamma, stdtrit
 
 from amrepair.arrays import Points, Values, Vector
 from amrepair.errors import InputError
-from amrepair.frames import unit_vectors
+from amrepair.frames import grid_points, unit_vectors
 from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.learned import TOLERATED_SPREADS, LearnedSdf, Tolerance
 
@@ -319,7 +319,7 @@ def _tolerance(template: GridSdf, sound: SoundParts, options: SoundOptions) -> T
     low, high = template.bounds_mm + np.array([[-1.0], [1.0]]) * options.reach_mm
     shape = np.ceil((high - low) / options.site_mm).astype(int)
     axes = [low[k] + options.site_mm * (np.arange(shape[k]) + 0.5) for k in range(3)]
-    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    centres = grid_points(*axes)
     f_mm = template.distance(centres)
     near = np.flatnonzero(np.abs(f_mm) < options.reach_mm)
     spread = np.zeros(len(centres))
