@@ -18,7 +18,7 @@ from amrepair.loop.run import run_loop
 from amrepair.loop.setting import Recorded, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import Tape, read_events
-from amrepair.policy.again import changed, decided_again
+from amrepair.policy.replay import changed, decided_again
 from amrepair.scans import Scan, ScanRequest
 from gcode.hosts.file import FilePrinter
 from gcode.progress import Progress, silent

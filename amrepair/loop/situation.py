@@ -11,9 +11,9 @@ from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions, decide, gravest, judge
+from amrepair.policy.limits import exceeded
 from amrepair.policy.passes import is_little, is_stuck
 from amrepair.policy.table import Action, Situation
-from amrepair.policy.unasked import exceeded
 from amrepair.policy.worth import volume_mm3
 from amrepair.repair import RepairPlan, Site
 from gcode.profiles import ProcessProfile

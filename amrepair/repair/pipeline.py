@@ -32,11 +32,11 @@ from amrepair.regions.calibration import NORMAL_NOISE, of_touches
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import PoseKnown, tolerances
 from amrepair.repair import in_view
-from amrepair.repair.alike import registration_of_damage
 from amrepair.repair.filling import fillable, lines_of
 from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Finished, Site
 from amrepair.repair.stopwatch import Stopwatch
+from amrepair.repair.symmetry import registration_of_damage
 from amrepair.scans import PROBE, Scan
 from gcode.check import JobBridges, check
 from gcode.errors import CheckRefusedError

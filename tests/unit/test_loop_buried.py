@@ -16,7 +16,7 @@ from amrepair.cli.app import app as repair_app
 from amrepair.loop.buried import buried, buried_mm3, ways
 from amrepair.loop.looks import Stop
 from amrepair.policy import USUAL_POLICY, Action, decide
-from amrepair.policy.again import decided_again
+from amrepair.policy.replay import decided_again
 from amrepair.policy.table import Situation
 from amrepair.report.collect import loop_result
 from gcode.cli.app import app as gcode_app

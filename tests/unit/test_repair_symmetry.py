@@ -14,7 +14,7 @@ from jaxtyping import Float
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.repair import RepairPlan, Site, plan_repair
-from amrepair.repair.alike import registration_of_damage
+from amrepair.repair.symmetry import registration_of_damage
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.profiles import load_setup

@@ -1,4 +1,4 @@
-"""What may be printed without asking: limits that the process profile sets."""
+"""The limits a process profile sets on what is printed without asking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which of the poses that fit a scan equally well the part stands in."""
+"""A symmetric part fits a scan in several poses: in which of them it stands, by its damage."""
 
 from __future__ import annotations
 
