@@ -27,6 +27,8 @@ from amrepair.template.port import Template
 
 # Capacities are whole numbers of this share of a nat; none is larger than that many.
 UNIT_NATS, MOST_NATS = 0.01, 1e4
+# So often at most a labelling is asked for without what was sealed in the last.
+MOST_SEALED = 3
 # Before and behind a plane, in voxels: there its sides are looked up.
 LOOK_VOXELS = (0.75, 1.5, 2.5)
 # Blocks of so many voxels a side whose middle is so many sides from the template's surface are
@@ -191,10 +193,11 @@ def find_occupancy(
     unseen = _nats_unseen(normals, seen, (grid.voxel_mm / spacing_mm) ** 2, options)
     scan = replace(scan, on_mm=on_mm[in_box(on_mm, *box_mm)])
     facets = _facets(grid)
-    nats = unseen[facets.axis] * _unexplained(scan, facets, grid.voxel_mm)[:, None]
-    cut = _Cut.of(facets, nats, _told(scan, grid))
+    unexplained = _unexplained(scan, facets, grid.voxel_mm)
+    cut = _Cut.of(facets, unseen[facets.axis] * unexplained[:, None], _told(scan, grid))
+    mouths = _Mouths.of(scan, facets, unexplained, grid)
     solid = np.zeros(grid.number.shape, bool)
-    solid[grid.number >= 0] = ~_with_open_sides(scan, cut, grid)
+    solid[grid.number >= 0] = ~_with_open_sides(scan, cut, grid, mouths)
     found = _as_seen(solid, scan, grid)
     found |= _guessed(found, (*surface, seen), scan, grid)
     return Occupancy(grid.low_mm, grid.voxel_mm, found, grid.f_mm < 0)
@@ -470,6 +473,64 @@ def _in_units(nats: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
 
 
 @dataclass(frozen=True, slots=True)
+class _Mouths:
+    """Where one could look into the template: its surface that no point lies on.
+
+    Whoever scanned the broken surface of a void looked in from outside, so that a void without a
+    mouth a bead wide is none. A cut cannot say so: where most of a part is gone the cheapest
+    labelling may be a void sealed in what was seen to stand, under the broken surface and not over
+    it.
+
+    Attributes
+    ----------
+    grid
+        Of the voxels.
+    mouth_mm2
+        (v,) unseen surface of each voxel in the template.
+    least_mm2, least
+        Of a mouth; voxels of a void that is worth a question.
+    """
+
+    grid: _Grid
+    mouth_mm2: Values
+    least_mm2: float
+    least: float
+
+    @classmethod
+    def of(cls, scan: _Scanned, facets: _Facets, unexplained: Values, grid: _Grid) -> _Mouths:
+        """Of the facets on the template's surface that scanned points do not explain."""
+        at = facets.on_template & (unexplained > 0.0)
+        inside = np.append(grid.is_inside, False)
+        one, other = facets.one[at], facets.other[at]
+        within = np.where(inside[one], one, other)
+        mouth_mm2 = np.bincount(within, minlength=len(inside) - 1) * grid.voxel_mm**2
+        least_mm2 = float(np.pi * scan.options.bead_mm**2)
+        return cls(grid, mouth_mm2, least_mm2, least_mm2 / scan.spacing_mm**2)
+
+    def sealed(self, empty: Mask) -> Mask:
+        """(v,) what is empty and should not be, with no way to the outside."""
+        within = self.grid.number >= 0
+        void = np.zeros(within.shape, bool)
+        void[within] = empty & self.grid.is_inside
+        group = ndimage.label(void)[0][within]
+        mouth_mm2 = np.bincount(group, self.mouth_mm2)
+        shut = (mouth_mm2 < self.least_mm2) & (np.bincount(group) >= self.least)
+        shut[0] = False
+        return np.asarray(shut[group])
+
+    def cheapest(self, cut: _Cut, told: Values) -> Mask:
+        """(v,) what is empty by the cheapest labelling without what is sealed."""
+        empty = cut.empty if told is cut.told else cut.labelled(told)
+        for _ in range(MOST_SEALED):
+            sealed = self.sealed(empty)
+            if not sealed.any():
+                break
+            told = np.where(sealed, MOST_NATS, told)
+            empty = cut.labelled(told)
+        return empty
+
+
+@dataclass(frozen=True, slots=True)
 class _Sides:
     """Voxels on both sides of broken surface, and what it costs where both are solid.
 
@@ -485,6 +546,9 @@ class _Sides:
         (q,) neither side is.
     beyond
         (2, q) voxels farther off, before and behind.
+    within
+        (2, q) voxels of the template, toward and away, as far off as the labelled surface may be
+        put from its points; −1 is air, or was not looked at.
     price
         Of a place with material on both sides, nats.
     """
@@ -493,6 +557,7 @@ class _Sides:
     away: Numbers
     askew: Mask
     beyond: Int[np.ndarray, "2 q"]
+    within: Int[np.ndarray, "2 q"]
     price: float
 
     @classmethod
@@ -505,16 +570,20 @@ class _Sides:
             grid.numbers_at(broken.place_mm + way * step_mm)
             for way in (1.0, -1.0, LOOK_VOXELS[-1], -LOOK_VOXELS[-1])
         )
+        far = (_width_mm(scan, grid.voxel_mm) + 0.5 * grid.voxel_mm) / grid.voxel_mm
+        within = np.stack([grid.numbers_at(broken.place_mm + way * step_mm) for way in (far, -far)])
+        within[within >= 0] = np.where(grid.is_inside[within[within >= 0]], within[within >= 0], -1)
         askew = np.abs(along) < options.way_cosine
         # of a wide facet's many places together no more is known than of a facet that nobody saw
         most = -np.log1p(-options.largest_cover) / (grid.voxel_mm / scan.spacing_mm) ** 2
         price = float(min(-np.log(options.stray), most))
-        return cls(toward, away, askew, np.stack(beyond), price)
+        return cls(toward, away, askew, np.stack(beyond), within, price)
 
     def is_shut(self, empty: Mask) -> Bool[np.ndarray, " q"]:
-        """(q,) whether both sides are solid."""
-        solid = np.append(~empty, False)
-        return np.asarray(solid[self.toward] & solid[self.away])
+        """(q,) whether both sides are solid, as far off as surface may be put."""
+        solid, void = np.append(~empty, False), np.append(empty, False)
+        shut = solid[self.toward] & solid[self.away]
+        return np.asarray(shut & ~void[self.within].any(axis=0))
 
     def proposed(self, empty: Mask, room: Numbers, told: Values, least: float) -> Iterator[Values]:
         """What voxels would say were shut places open towards the surface; away from it, as in a
@@ -532,7 +601,7 @@ class _Sides:
             yield np.where(room == k, -MOST_NATS, told)
 
 
-def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid) -> Mask:
+def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid, mouths: _Mouths) -> Mask:
     """What is empty by a cut, or by a cheaper labelling in which broken surface has an open side.
 
     As much of it as is around a bead must have none, or it stays.
@@ -543,7 +612,7 @@ def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid) -> Mask:
     def cost(labels: Mask) -> float:
         return cut.cost(labels) + float(sides.price * sides.is_shut(labels).sum())
 
-    empty = cut.empty
+    empty = mouths.cheapest(cut, cut.told)
     if sides.is_shut(empty).sum() < least:
         return empty
     within = grid.number >= 0
@@ -558,9 +627,9 @@ def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid) -> Mask:
     room = ndimage.label(uncut)[0][within]
     best, least_cost = empty, cost(empty)
     for proposed in sides.proposed(empty, room, cut.told, least):
-        if cut.cost(empty) + cut.least_rise(proposed) > least_cost:
+        if cut.cost(cut.empty) + cut.least_rise(proposed) > least_cost:
             continue
-        tried = cut.labelled(proposed)
+        tried = mouths.cheapest(cut, proposed)
         if (price := cost(tried)) < least_cost:
             best, least_cost = tried, price
     return best
