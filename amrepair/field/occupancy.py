@@ -488,7 +488,8 @@ class _Mouths:
     mouth_mm2
         (v,) unseen surface of each voxel in the template.
     least_mm2, least
-        Of a mouth; voxels of a void that is worth a question.
+        Of a mouth; as many points lie on so much surface: fewer places, or voxels of a void, are
+        not worth a question.
     """
 
     grid: _Grid
@@ -570,9 +571,9 @@ class _Sides:
             grid.numbers_at(broken.place_mm + way * step_mm)
             for way in (1.0, -1.0, LOOK_VOXELS[-1], -LOOK_VOXELS[-1])
         )
-        far = (_width_mm(scan, grid.voxel_mm) + 0.5 * grid.voxel_mm) / grid.voxel_mm
+        far = _width_mm(scan, grid.voxel_mm) / grid.voxel_mm + 0.5
         within = np.stack([grid.numbers_at(broken.place_mm + way * step_mm) for way in (far, -far)])
-        within[within >= 0] = np.where(grid.is_inside[within[within >= 0]], within[within >= 0], -1)
+        within = np.where(np.append(grid.is_inside, False)[within], within, -1)
         askew = np.abs(along) < options.way_cosine
         # of a wide facet's many places together no more is known than of a facet that nobody saw
         most = -np.log1p(-options.largest_cover) / (grid.voxel_mm / scan.spacing_mm) ** 2
@@ -607,13 +608,12 @@ def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid, mouths: _Mouths) ->
     As much of it as is around a bead must have none, or it stays.
     """
     sides = _Sides.of(scan, grid)
-    least = np.pi * (scan.options.bead_mm / scan.spacing_mm) ** 2
 
     def cost(labels: Mask) -> float:
         return cut.cost(labels) + float(sides.price * sides.is_shut(labels).sum())
 
     empty = mouths.cheapest(cut, cut.told)
-    if sides.is_shut(empty).sum() < least:
+    if sides.is_shut(empty).sum() < mouths.least:
         return empty
     within = grid.number >= 0
     uncut = within.copy()
@@ -626,7 +626,7 @@ def _with_open_sides(scan: _Scanned, cut: _Cut, grid: _Grid, mouths: _Mouths) ->
     uncut &= ~ndimage.binary_dilation(scanned, np.ones((3, 3, 3), bool))
     room = ndimage.label(uncut)[0][within]
     best, least_cost = empty, cost(empty)
-    for proposed in sides.proposed(empty, room, cut.told, least):
+    for proposed in sides.proposed(empty, room, cut.told, mouths.least):
         if cut.cost(cut.empty) + cut.least_rise(proposed) > least_cost:
             continue
         tried = mouths.cheapest(cut, proposed)

@@ -164,10 +164,11 @@ def observed(
             seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
     if surfels.spacing_mm > options.spacing_mm:
         surface_mm, normals = template.surface_points(surfels.spacing_mm)
-    nearest = nearest_within(surface_mm, surfels.place_mm, PRESENT_CELLS * surfels.cell_mm)
+    present_mm = PRESENT_CELLS * surfels.cell_mm
+    nearest = nearest_within(surface_mm, surfels.place_mm, present_mm)
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
     crossed = _crossed(seen, surfels, outward, surface_mm, normals)
-    present_mm, planes = PRESENT_CELLS * surfels.cell_mm, options.evidence.faces.plane_points
+    planes = options.evidence.faces.plane_points
     on = ShownSurface(surface_mm, normals, nearest >= 0, present_mm)
     # where rays are known they tell what of a wall is gone
     ends = NO_ENDS if seen else wall_ends(scan, template, surfels, on, planes, options.wall_ends)
