@@ -150,6 +150,9 @@ def _grown_back(
     if not sought.is_excess:
         wanted = f_mm.reshape(box.shape) < 0
         field = np.where(_hangs_free(wanted, shaped < 0, field < 0), shaped, field)
+    # what is enclosed in mid-air is nothing that stands: there it is as designed
+    enclosed = ndimage.binary_fill_holes(field < 0) & (field >= 0)
+    field = np.where(enclosed, sought.sign * -f_mm.reshape(box.shape), field)
     return solids_from_field(box, field, sought.options.voxels.crumb_mm3)
 
 

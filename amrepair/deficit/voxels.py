@@ -18,6 +18,7 @@ from amrepair.field.groups import connected
 from amrepair.frames import grid_points
 from gcode.solids import as_manifold, is_valid
 
+Surface = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 SURFACE_STEPS = 4.0  # of a grid: more than the longest way between corners of a cube
 
 
@@ -94,7 +95,7 @@ def solids_from_field(
 ) -> list[manifold3d.Manifold]:
     """Where the field is negative, closed at the box's faces: a solid each that holds together.
 
-    None that is smaller than `least_mm3`; a hollow within one is filled.
+    None that is smaller than `least_mm3`; a smaller hollow within one is filled.
 
     Raises
     ------
@@ -110,31 +111,43 @@ def solids_from_field(
     extract: Any = measure.marching_cubes
     for method in ("lewiner", "lorensen"):
         vertices, faces, _, _ = extract(padded, 0.0, spacing=tuple(box.step_mm), method=method)
-        solids = [
-            as_manifold(*surface)
-            for surface in _apart(vertices + (box.low_mm - box.step_mm), faces, least_mm3)
-        ]
-        if all(is_valid(solid) for solid in solids):
-            return solids
+        surfaces = _apart(vertices + (box.low_mm - box.step_mm), faces, least_mm3)
+        shells, hollows = ([as_manifold(*surface) for surface in each] for each in surfaces)
+        if all(is_valid(solid) for solid in shells + hollows):
+            return [_without(shell, hollows) for shell in shells]
     raise DeficitError(
         f"the surface of a defect near {np.round(box.low_mm, 1).tolist()} mm is not a valid solid; "
         "scan again with finer spacing"
     )
 
 
+def _without(shell: manifold3d.Manifold, hollows: list[manifold3d.Manifold]) -> manifold3d.Manifold:
+    """A solid without the hollows that lie in it; one that it lies in itself is larger."""
+    volume_mm3 = shell.volume()
+    within = [hollow for hollow in hollows if hollow.volume() < volume_mm3]
+    if not within:
+        return shell
+    return manifold3d.Manifold.batch_boolean([shell, *within], manifold3d.OpType.Subtract)
+
+
 def _apart(
     vertices_mm: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], least_mm3: float
-) -> list[tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]]:
-    """Closed surfaces of which none touches another, without what holds too little."""
+) -> tuple[list[Surface], list[Surface]]:
+    """Closed surfaces, of which none touches another: outer ones, and hollows' turned outward.
+
+    Without those that hold too little.
+    """
     one, other = faces[:, :2].ravel(), faces[:, 1:].ravel()
     body = connected(one, other, len(vertices_mm))
     # about a corner near by: large numbers would cancel
     corner = (vertices_mm - vertices_mm[0])[faces]
     six_fold_mm3 = np.linalg.det(corner)
     volume_mm3 = np.bincount(body[faces[:, 0]], six_fold_mm3) / 6.0
-    found = []
-    for large in np.flatnonzero(volume_mm3 >= least_mm3):
+    found: tuple[list[Surface], list[Surface]] = [], []
+    for large in np.flatnonzero(np.abs(volume_mm3) >= least_mm3):
         own = body == large
         number = np.cumsum(own) - 1
-        found.append((vertices_mm[own], number[faces[own[faces[:, 0]]]]))
+        turned = volume_mm3[large] < 0
+        corners = number[faces[own[faces[:, 0]]]]
+        found[int(turned)].append((vertices_mm[own], corners[:, ::-1] if turned else corners))
     return found

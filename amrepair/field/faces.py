@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float, Int
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import faces_kernels as kernels
 from amrepair.field.fused import Surfels
-from amrepair.field.occupancy import Broken, Occupancy, find_occupancy
+from amrepair.field.occupancy import find_occupancy
 from amrepair.field.options import EvidenceOptions, FaceOptions
 from amrepair.field.places import PlaceTree
+from amrepair.field.space import Broken, Occupancy
 from amrepair.frames import unit_vectors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -124,12 +125,12 @@ class Faces:
         best, distance = near.value_mm, near.distance_mm
         beside_mm = options.beside_spacings * s + options.beside_per_height * near.height_mm
         far = (distance > near_mm) | (near.sideways_mm > beside_mm)
-        ask = np.flatnonzero(far | (distance > self.occupancy.voxel_mm))
-        told = self.occupancy.at(points_mm[ask])
-        designed = -np.sign(f_mm[ask])
-        solid = np.where((told == 0) | (designed < 0), designed, np.sign(told))
-        decided = far[ask] | (best[ask] * solid > 0)
-        best[ask[decided]] = -solid[decided] * distance[ask[decided]]
+        ask = far | (distance > self.occupancy.voxel_mm)
+        solid, within = -np.sign(f_mm), np.flatnonzero(ask & (f_mm < 0))
+        told = self.occupancy.at(points_mm[within])
+        solid[within] = np.where(told == 0, 1.0, np.sign(told))
+        decided = far | (ask & (best * solid > 0))
+        best[decided] = -solid[decided] * distance[decided]
         return best
 
 

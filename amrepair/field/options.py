@@ -42,7 +42,7 @@ class OccupancyOptions:
     hidden_cover
         Bare surface is hidden rather than gone if less was seen of what faces the same way.
     deep_mm
-        So deep is a void that is as improbable as that nobody saw the surface over its mouth.
+        A void is less probable by one nat for every so much of its depth.
     hole_mm, margin_mm
         Unseen places so near to each other are one hole; space looked at around what is broken.
     bead_mm, least_seen

@@ -15,16 +15,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from amrepair.deficit import compute_deficit
-from amrepair.field.occupancy import (
-    UNIT_NATS,
-    Broken,
-    _Cut,
-    _Facets,
-    _facets,
-    _Grid,
-    find_occupancy,
-)
+from amrepair.field.minimum_cut import UNIT_NATS, Facets, MinimumCut, facets_of
+from amrepair.field.occupancy import find_occupancy
 from amrepair.field.options import OccupancyOptions
+from amrepair.field.space import Broken, VoxelGrid
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
@@ -45,7 +39,7 @@ def test_the_labelling_is_the_cheapest_of_all_and_of_those_has_the_most_solid(
     number[number >= 0] = np.arange((number >= 0).sum())
     count = int(number.max(initial=-1)) + 1
     f_mm = np.where(number < 0, 1.0, -1.0)
-    facets = _facets(_Grid(np.zeros(3), 1.0, f_mm, number))
+    facets = facets_of(VoxelGrid(np.zeros(3), 1.0, f_mm, number))
     nats = rng.integers(0, 4, (len(facets.one), 2)).astype(float)
     told = rng.integers(-5, 6, count).astype(float)
 
@@ -57,7 +51,7 @@ def test_the_labelling_is_the_cheapest_of_all_and_of_those_has_the_most_solid(
 
     every = list(itertools.product([False, True], repeat=count))
     best = min(every, key=lambda empty: (cost(empty), sum(empty)))
-    assert _Cut.of(facets, nats, told).empty.tolist() == list(best)
+    assert MinimumCut.of(facets, nats, told).empty.tolist() == list(best)
 
 
 @settings(max_examples=30, deadline=None)
@@ -67,20 +61,22 @@ def test_what_is_empty_is_what_scipys_largest_flow_leaves_reaching_empty(
 ) -> None:
     rng = np.random.default_rng(seed)
     number = np.arange(int(np.prod(shape))).reshape(shape)
-    facets = _facets(_Grid(np.zeros(3), 1.0, np.full(shape, -1.0), number))
+    facets = facets_of(VoxelGrid(np.zeros(3), 1.0, np.full(shape, -1.0), number))
     count, some = number.size, len(facets.one)
     nats = UNIT_NATS * np.where(rng.random((some, 2)) < 0.3, 0, rng.integers(0, 60, (some, 2)))
     # most is solid, a little; here and there something is empty for certain
     told = UNIT_NATS * np.where(
         rng.random(count) < 0.1, rng.integers(-400, 0, count), rng.integers(0, 30, count)
     )
-    less = told - UNIT_NATS * np.where(rng.random(count) < 0.2, rng.integers(0, 300, count), 0)
-    cut = _Cut.of(facets, nats, told)
+    other = told + UNIT_NATS * np.where(rng.random(count) < 0.2, rng.integers(-300, 300, count), 0)
+    more = nats + UNIT_NATS * rng.integers(0, 60, nats.shape)
+    cut = MinimumCut.of(facets, nats, told)
     np.testing.assert_array_equal(cut.empty, by_scipy(facets, nats, told))
-    np.testing.assert_array_equal(cut.labelled(less), by_scipy(facets, nats, less))
+    dearer = cut.dearer(more, other)
+    np.testing.assert_array_equal(dearer.empty, by_scipy(facets, more, other))
 
 
-def by_scipy(facets: _Facets, nats: np.ndarray, told: np.ndarray) -> np.ndarray:
+def by_scipy(facets: Facets, nats: np.ndarray, told: np.ndarray) -> np.ndarray:
     count = len(told)
     every = np.arange(count)
     rows = np.concatenate([facets.one, facets.other, np.full(count, count), every])
