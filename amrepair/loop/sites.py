@@ -12,7 +12,6 @@ from scipy import ndimage
 
 from amrepair.arrays import Mask, Points
 from amrepair.frames import Transform
-from amrepair.loop.in_turn import finished_at, refuse_own_hits, template_of
 from amrepair.loop.locate import (
     BESIDE_THE_PART,
     MOVED_MM,
@@ -25,6 +24,7 @@ from amrepair.loop.locate import (
     walls_moved_mm,
 )
 from amrepair.loop.looks import Stop
+from amrepair.loop.sequential_objects import finished_at, refuse_own_hits, template_of
 from amrepair.regions import detect
 from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions

@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any
 
 from amrepair.policy.options import USUAL_POLICY, PolicyOptions
-from amrepair.policy.ways import Way
+from amrepair.policy.remedies import Way
 from amrepair.regions.anomaly import DefectType
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from amrepair.deficit import Deficit
 from amrepair.frames import Transform, nearest_box
-from amrepair.policy import PolicyOptions, worth
+from amrepair.policy import PolicyOptions, acceptance
 from amrepair.regions import Label, Region
 from amrepair.repair.site import Site
 from gcode.meshes import box_of_solid
@@ -27,10 +27,10 @@ def fillable(
     known = [region.box_mm for region in regions]
     of_piece = [regions[nearest_box(known, box)] if regions else None for box in boxes]
     weighed = [
-        worth.Piece(box, piece.volume(), skipped=region is not None and region.skipped)
+        acceptance.Piece(box, piece.volume(), skipped=region is not None and region.skipped)
         for box, piece, region in zip(boxes, pieces, of_piece, strict=True)
     ]
-    keep = worth.worth_mending(weighed, policy)
+    keep = acceptance.worth_mending(weighed, policy)
     filled = [
         piece
         for piece, region, kept in zip(pieces, of_piece, keep, strict=True)

@@ -31,8 +31,9 @@ from amrepair.regions.bed import by_beds, of_bed
 from amrepair.regions.calibration import NORMAL_NOISE, of_touches
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import PoseKnown, tolerances
-from amrepair.repair import in_view
+from amrepair.repair import scan_scope
 from amrepair.repair.filling import fillable, lines_of
+from amrepair.repair.path_offsets import off_by_job
 from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Finished, Site
 from amrepair.repair.stopwatch import Stopwatch
@@ -188,19 +189,19 @@ def _align(
     """Lay the scan into the template; a pose in which a part cannot stand is refused."""
     with ThreadPoolExecutor(1) as beside:
         # what rays saw needs no pose, nor it them; a part of the scan has images of its own
-        seen = None if in_view.is_cut(site) else beside.submit(range_images, scan)
+        seen = None if scan_scope.ends_in_air(site) else beside.submit(range_images, scan)
         known = guess if scan.frame == PROBE else None
         if known is not None:
             registration = Registration.known(known)
         else:
             registration = align(
-                scan if guess is None else in_view.without_finished(scan, site, guess),
+                scan if guess is None else scan_scope.without_finished_objects(scan, site, guess),
                 site.template,
                 guess=guess,
                 part_is_known=site.part_is_known,
-                so_far=in_view.so_far(site),
-                aside=in_view.laid_aside(site),
-                options=in_view.aligning(site),
+                so_far=scan_scope.planned_so_far(site),
+                aside=scan_scope.beside_part(site),
+                options=scan_scope.align_options(site),
                 rng=rng,
                 progress=progress,
             )
@@ -211,12 +212,14 @@ def _align(
         refuse_impossible(site.template, placed, printer, said=said, raised=raised)
     moved = registration.template_from_scan
     whole = scan.moved(moved)
-    own = in_view.without_finished(whole, site, Transform.identity("template", "template"))
+    own = scan_scope.without_finished_objects(
+        whole, site, Transform.identity("template", "template")
+    )
     return _Laid(
         registration,
         placed,
         whole,
-        in_view.of_layer(in_view.of_the_part(own, site), site),
+        scan_scope.within_planned(scan_scope.without_beside(own, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
         "told" if known is not None else "stands" if scan.frame == "build" and said else "free",
     )
@@ -257,11 +260,11 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
         site.expected,
         options=_region_options(site),
         calibration=site.calibration,
-        top_z_mm=in_view.top_of_layer(site),
+        top_z_mm=scan_scope.layer_top_mm(site),
         images=laid.images,
         surface=site.surface,
         pose=laid.pose,
-        off_by_job=in_view.off_by_job(site, laid.placed),
+        off_by_job=off_by_job(site, laid.placed),
         progress=progress,
     )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from amrepair.align.registration import Registration
 from amrepair.deficit import Deficit
 from amrepair.frames import Transform
-from amrepair.policy import USUAL_POLICY, PolicyOptions, worth
+from amrepair.policy import USUAL_POLICY, PolicyOptions, acceptance
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.calibrating import Sound
 from amrepair.scans import Scan
@@ -70,12 +70,12 @@ class RepairPlan:
     @property
     def to_fill(self) -> tuple[Region, ...]:
         """Missing regions that are worth a repair: alone, or with those beside them."""
-        return worth.to_fill(self.deficit.regions, self.policy)
+        return acceptance.to_fill(self.deficit.regions, self.policy)
 
     @property
     def too_much(self) -> tuple[Region, ...]:
         """Regions in excess that stand out."""
-        return worth.too_much(self.deficit.regions, self.layer_height_mm, self.policy)
+        return acceptance.too_much(self.deficit.regions, self.layer_height_mm, self.policy)
 
     @property
     def within_tolerance(self) -> bool:
