@@ -14,7 +14,7 @@ def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_
 
 
 def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
-    """Whether only a small share of what was found is left: a further pass would mostly add rims."""
+    """Whether little of what was found is left: a further pass would mostly add rims."""
     return left_mm3 <= options.little_ratio * found_mm3
 
 

@@ -14,9 +14,9 @@ from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.inspected import Inspected
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import Sites
 from amrepair.template.port import Template
 
 
@@ -119,8 +119,8 @@ class AnomalyMap:
         What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
         may be, by what normal parts differ and the process was told; None for a map read back
         from a file.
-    sites
-        What the test looked at; None for a map read back from a file.
+    inspected
+        The places that were tested; None for a map read back from a file.
     noise, nuisance, contradicting
         What the scan told of its errors, what belongs to the whole part (None where the pose is
         told), and views that were left out.
@@ -146,7 +146,7 @@ class AnomalyMap:
     surfel_higher_mm: Float[np.ndarray, " s"] | None = None
     top_z_mm: float | None = None
     top_threshold_mm: float = np.inf
-    sites: Sites | None = None
+    inspected: Inspected | None = None
     noise: Noise | None = None
     nuisance: Nuisance | None = None
     contradicting: tuple[Contradiction, ...] = ()

@@ -12,22 +12,15 @@ from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
 from amrepair.regions.calibrating import Sound, sound_scales
 from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.inspected import Inspected, OffByJob, inspected_of, tolerances
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
+from amrepair.regions.observation import Observed, observed
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import Tested, find_regions
 from amrepair.regions.significance import LEAST_PEAKS, Level, as_student, tested
-from amrepair.regions.sites import (
-    Observed,
-    OffByJob,
-    PoseKnown,
-    Sites,
-    agreed,
-    observed,
-    sites_of,
-    tolerances,
-)
 from amrepair.regions.strands import on_strands
+from amrepair.regions.systematic import PoseKnown, without_systematic_errors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -91,15 +84,15 @@ def detect(
     options = options or RegionOptions()
     progress("detect", 0.0, 4.0)
 
-    def observe(without: tuple[int, ...]) -> tuple[Observed, Sites]:
+    def observe(without: tuple[int, ...]) -> tuple[Observed, Inspected]:
         seen = observed(scan, template, options, images, surface, without)
-        return seen, sites_of(seen, options, top_z_mm, off_by_job)
+        return seen, inspected_of(seen, options, top_z_mm, off_by_job)
 
     # a layer that lacks as a whole is no pose: how high its top lies the job has said
     held = "told" if top_z_mm is not None else pose
-    seen, sites, nuisance, contradicting = agreed(observe, held, options)
+    seen, inspected, nuisance, contradicting = without_systematic_errors(observe, held, options)
     progress("detect", 1.0, 4.0)
-    test = _tested(seen, sites, options, calibration)
+    test = _tested(seen, inspected, options, calibration)
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, options)
     progress("detect", 3.0, 4.0)
@@ -107,7 +100,7 @@ def detect(
     score = np.abs(seen.f_mm)
     k = min(options.top_k, int(seen.keep.sum()))
     surfel_label = np.where(test.missing, int(Label.MISSING), test.excess * int(Label.EXCESS))
-    allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]
+    allowed_mm = inspected.tolerance_mm[1] - inspected.tolerance_mm[0]
     progress("detect", 4.0, 4.0)
     return AnomalyMap(
         points_mm=scan.points_mm,
@@ -125,7 +118,7 @@ def detect(
         evidence=evidence,
         surfel_label=surfel_label,
         surfel_higher_mm=np.maximum(allowed_mm[: len(seen.surfels)], 0.0),
-        sites=sites,
+        inspected=inspected,
         noise=test.noise,
         nuisance=nuisance,
         contradicting=contradicting,
@@ -136,21 +129,21 @@ def detect(
 
 
 def _tested(
-    seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
+    seen: Observed, inspected: Inspected, options: RegionOptions, calibration: Calibration | None
 ) -> Tested:
     """Test every scale, and grow regions from where it is significant."""
     cells, gone_to = len(seen.surfels), len(seen.surfels) + len(seen.crossed.which)
-    levels = tested(sites, options, calibration)
+    levels = tested(inspected, options, calibration)
     if calibration == NORMAL_NOISE and _erratic(levels, options):  # the scan itself contradicts
-        levels, calibration = tested(sites, options, None), None
+        levels, calibration = tested(inspected, options, None), None
     # what errors leave in strips neither a scan nor a calibration tells: only where they are known
     # to be normal is there any
     strands = np.zeros(len(seen.surfels), bool)
     if calibration == NORMAL_NOISE:
-        strands = _strands(seen, sites, levels, options)
+        strands = _strands(seen, inspected, levels, options)
     tolerances_mm = tolerances(options, seen.template)
     labels, log_p = grown(
-        levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
+        levels, inspected.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
     )
     gone = np.zeros(len(seen.surface_mm), bool)
     gone[seen.crossed.which] = labels[0, cells:gone_to]
@@ -220,13 +213,13 @@ def judged_scales(anomaly: AnomalyMap) -> Sound:
 
     As the scan itself tells, whatever calibration it was judged by.
     """
-    assert anomaly.sites is not None
+    assert anomaly.inspected is not None
     assert anomaly.options is not None
-    return sound_scales(tested(anomaly.sites, anomaly.options, None), anomaly.options)
+    return sound_scales(tested(anomaly.inspected, anomaly.options, None), anomaly.options)
 
 
 def _strands(
-    seen: Observed, sites: Sites, levels: tuple[Level, ...], options: RegionOptions
+    seen: Observed, inspected: Inspected, levels: tuple[Level, ...], options: RegionOptions
 ) -> Mask:
     """(n,) cells of strips narrower than any window that stand out along their length.
 
@@ -236,7 +229,7 @@ def _strands(
     first = levels[1]
     cells = slice(len(surfels))
     usual_mm = float(np.median(first.tolerance_mm[1]))
-    higher_mm = sites.value_mm[cells] - sites.tolerance_mm[1, cells] + usual_mm
+    higher_mm = inspected.value_mm[cells] - inspected.tolerance_mm[1, cells] + usual_mm
     per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
     # of what is as narrow as a few cells, errors have a tail as long as that of those cells
     critical = float(max(first.critical[1], levels[0].critical[1]))

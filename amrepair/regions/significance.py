@@ -26,8 +26,8 @@ from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.frames import cells_of
 from amrepair.regions.calibration import Calibration
+from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import Sites
 
 # A quarter of the differences of two standard normal values are smaller: √2 Φ⁻¹(5/8).
 PAIR_QUARTILE = float(np.sqrt(2.0) * ndtri(0.625))
@@ -229,17 +229,17 @@ def as_student(z: float, freedom: Values) -> Values:
 
 
 def tested(
-    sites: Sites, options: RegionOptions, calibration: Calibration | None
+    inspected: Inspected, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Level, ...]:
     """Test every scale's medians, and the third deepest and highest cells of the first."""
     scales = scales_of(
-        sites.place_mm,
-        sites.normal,
-        sites.value_mm,
-        sites.weight,
-        cell_mm=sites.cell_mm,
+        inspected.place_mm,
+        inspected.normal,
+        inspected.value_mm,
+        inspected.weight,
+        cell_mm=inspected.cell_mm,
         widest_mm=options.widest_mm,
-        apart=sites.apart,
+        apart=inspected.apart,
     )
     share = options.false_regions / (2 * (len(scales) + 1))
     levels = []
@@ -247,7 +247,7 @@ def tested(
         size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
         cells = (
             np.bincount(scale.of_base, told, len(scale)) / size
-            for told in (*sites.tolerance_mm, sites.facing, sites.pose_mm)
+            for told in (*inspected.tolerance_mm, inspected.facing, inspected.pose_mm)
         )
         *delta, faced, pose = (
             scales_kernels.window_means(scale.table, scale.count, told) for told in cells

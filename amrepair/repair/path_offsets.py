@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Mask, Points, Values
 from amrepair.frames import Transform, unit_vectors
-from amrepair.regions.sites import OffByJob
+from amrepair.regions.inspected import OffByJob
 from amrepair.repair.options import RepairOptions
 from amrepair.repair.site import Site
 from amrepair.template.laid import LaidBeads

@@ -29,8 +29,9 @@ from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.bed import by_beds, of_bed
 from amrepair.regions.calibration import NORMAL_NOISE, of_touches
+from amrepair.regions.inspected import tolerances
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import PoseKnown, tolerances
+from amrepair.regions.systematic import PoseKnown
 from amrepair.repair import scan_scope
 from amrepair.repair.filling import fillable, lines_of
 from amrepair.repair.path_offsets import off_by_job
