@@ -16,7 +16,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.frames import box_of, boxes_meet, cells_of, diagonal
 from amrepair.regions import AnomalyMap, Label
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.template.port import Template
 
 

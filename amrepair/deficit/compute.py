@@ -28,8 +28,9 @@ from amrepair.field.groups import area_per_point
 from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.regions.regions import classify
-from amrepair.regions.skipped import PlannedBeads, skipped
+from amrepair.regions.skipped import skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.meshes import box_of_solid

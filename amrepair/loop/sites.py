@@ -28,7 +28,7 @@ from amrepair.loop.sequential_objects import finished_at, refuse_own_hits, templ
 from amrepair.regions import detect
 from amrepair.regions.calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair import Detector, Site
 from amrepair.repair.options import USUAL_REPAIR
 from amrepair.repair.site import Finished, Raft

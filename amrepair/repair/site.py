@@ -16,7 +16,7 @@ from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.regions import AnomalyMap, detect
 from amrepair.regions.calibrating import Sound
 from amrepair.regions.calibration import Calibration
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair.options import USUAL_REPAIR, RepairOptions
 from amrepair.scans import Scan
 from amrepair.template.laid import LaidBeads
