@@ -1,4 +1,4 @@
-"""From a scan to a checked program, a call per stage."""
+"""The offline algorithm: from a scan to a checked program, with one call for each stage."""
 
 from __future__ import annotations
 
@@ -69,16 +69,25 @@ def plan_repair(
     Parameters
     ----------
     scan
-        In whatever frame its sensor has; in that of the printer's probe no pose is looked for.
+        In any frame. A scan in the frame of the printer's own probe needs no alignment.
+    site
+        What the scan is held against: template, printer, place on the bed, options.
+    title
+        The first line of the program.
     guess
-        A pose (template from the scan's frame) known beforehand; None searches from any pose.
+        A pose that is known beforehand, template from the scan's frame; None searches all poses.
     interruption
-        The state of the machine in mid-job; None makes a whole program for a standing part.
+        The machine's state, where a running job is interrupted for the repair; None makes a
+        program that stands alone, for a finished part.
     strict
-        Raise where the checker refuses the program; else return a plan without one, that says so:
-        a job must not die of a patch that is never sent.
+        Whether to raise where the checker refuses the program. If not, the plan comes back without
+        a program and says why: a running job must not die of a patch that is never sent.
     wanted
-        Which of the missing regions the program is to fill.
+        Says of each missing region whether the program is to fill it.
+    rng
+        For the search of a pose.
+    watch
+        Measures the time of each stage.
 
     Raises
     ------
@@ -133,19 +142,22 @@ def plan_repair(
 
 @dataclass(frozen=True, slots=True)
 class _Laid:
-    """A scan laid into its template.
+    """A scan that has been aligned to its template.
 
     Attributes
     ----------
+    registration
+        Template from scan.
     placed
         Build from template.
     whole, judged
-        The scan in the template's frame: all of it, and what is held against the template.
+        The scan in the template's frame: all of it, and only what is compared with the template.
     images
-        What rays saw, in the template's frame; None where what is expected ends in mid-air.
+        Its range images, in the template's frame; None where a planned template ends in mid-air.
     pose
-        How well it is known: told, as that of the printer's own probe; of a part that stands where
-        it was printed, in a scan in the printer's frame; or as the scan alone tells.
+        How well the pose is known: `told` by the printer's own probe; `stands` for a part that
+        stands where it was printed, scanned in the printer's frame; `free` where the scan alone
+        tells it.
     """
 
     registration: Registration
@@ -156,7 +168,7 @@ class _Laid:
     pose: PoseKnown
 
     def by(self, other: Registration) -> _Laid:
-        """The same scan in another pose of the part that it fits as well."""
+        """The same scan under another registration, of a symmetric part that fits in several."""
         motion = other.template_from_scan @ self.registration.template_from_scan.inverse()
         return replace(
             self,
@@ -167,7 +179,7 @@ class _Laid:
         )
 
     def plan(self, anomaly: AnomalyMap, deficit: Deficit, site: Site) -> RepairPlan:
-        """The verdict, as yet without a program."""
+        """The plan so far: what was found, without a patch or a program."""
         return RepairPlan(
             self.registration,
             anomaly,
@@ -187,9 +199,10 @@ def _align(
     rng: np.random.Generator | None,
     progress: Progress,
 ) -> _Laid:
-    """Lay the scan into the template; a pose in which a part cannot stand is refused."""
+    """Align the scan to the template, and refuse a pose in which the part cannot stand."""
     with ThreadPoolExecutor(1) as beside:
-        # what rays saw needs no pose, nor it them; a part of the scan has images of its own
+        # range images and the pose do not need each other, so they are made side by side; where
+        # only the last layers are judged, the detector makes the images of that part of the scan
         seen = None if scan_scope.ends_in_air(site) else beside.submit(range_images, scan)
         known = guess if scan.frame == PROBE else None
         if known is not None:
@@ -227,9 +240,10 @@ def _align(
 
 
 def _by_the_bed(laid: _Laid, site: Site) -> Site:
-    """Where nobody has told of the scanner's errors, the bed that is scanned with a part does.
+    """The site with the scanner's errors as the bed beside the part shows them.
 
-    And what it showed in the looks before.
+    Only where no calibration is known, so that normal noise would be assumed. The bed in earlier
+    looks of the same run counts too.
     """
     if site.calibration != NORMAL_NOISE:
         return site
@@ -247,7 +261,7 @@ def _by_the_bed(laid: _Laid, site: Site) -> Site:
 def _judge(
     laid: _Laid, site: Site, watch: Stopwatch, progress: Progress
 ) -> tuple[AnomalyMap, Deficit]:
-    """Find the regions, and make solids of them."""
+    """Find the regions that deviate, and make solids of them."""
     with watch("detect"):
         anomaly = _detect(laid, site, progress)
     with watch("deficit"):
@@ -255,7 +269,7 @@ def _judge(
 
 
 def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
-    """Hold the scan against what is expected."""
+    """Compare the scan with what is expected, and find the regions that deviate."""
     return site.detector(
         laid.judged,
         site.expected,
@@ -271,7 +285,7 @@ def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
 
 
 def _region_options(site: Site) -> RegionOptions:
-    """What regions are tested by here."""
+    """The options of the test, with the allowances of the site's process."""
     return replace(
         site.options.regions,
         allowance_mm=site.allowance_mm,
@@ -280,7 +294,7 @@ def _region_options(site: Site) -> RegionOptions:
 
 
 def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -> Deficit:
-    """Solids of what is missing and of what is too much, build frame."""
+    """Make solids of what is missing and of what is too much, build frame."""
     return compute_deficit(
         laid.judged,
         site.expected,
@@ -295,7 +309,10 @@ def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -
 
 
 def _as_built(laid: _Laid, anomaly: AnomalyMap, site: Site) -> AsBuilt:
-    """What stands there is all that was seen, the bottoms of open cells too."""
+    """How the heights of what stands on the bed are made for a print with open infill.
+
+    The scan's own heights count everywhere there, down to the floors of open cells.
+    """
     evidence = anomaly.evidence
     assert evidence is not None
     spacing_mm, images, options = (
@@ -316,7 +333,7 @@ def _as_built(laid: _Laid, anomaly: AnomalyMap, site: Site) -> AsBuilt:
 
 
 def _deficit_options(site: Site) -> DeficitOptions:
-    """What nobody saw stands no higher than the job, where one has just been printed there."""
+    """The deficit's options; what a job has just printed limits how high unseen places stand."""
     options = site.options.deficit
     if site.laid is None and site.planned is None:
         return options
@@ -327,9 +344,10 @@ def _deficit_options(site: Site) -> DeficitOptions:
 def _among_finished(
     as_built: HeightField, laid: _Laid, anomaly: AnomalyMap, finished: Finished, site: Site
 ) -> HeightField:
-    """What stands on the bed, and what else of the job does: as it was printed, and as it is seen.
+    """The heights of the part joined with those of the job's finished objects beside it.
 
-    Over all of it: the nozzle comes from beside the job, and goes back there.
+    Those stand as they were printed, and as high as this scan shows them. The field covers all of
+    the job, since the nozzle comes from beside it and goes back there.
     """
     assert anomaly.evidence is not None
     points_mm = laid.placed.apply(laid.whole.points_mm)
@@ -351,7 +369,7 @@ def _slice(
     lines: JobLines | None,
     progress: Progress,
 ) -> PatchPlan:
-    """Toolpaths that fill what is missing, onto what stands there."""
+    """Slice the missing solids to beads, laid onto what stands there."""
     x_mm = y_mm = z_mm = 0.0
     if interruption is not None:
         x_mm, y_mm, z_mm = (float(axis) for axis in interruption.position_mm)
@@ -378,13 +396,13 @@ def _checked(
     interruption: ModalState | None,
     strict: bool,
 ) -> RepairPlan:
-    """The plan with its program, written and checked, or with the reason why it has none."""
+    """The plan with its program, written and checked; or with the checker's refusal."""
     assert plan.patch is not None
     as_built, printer = plan.deficit.as_built, site.setup.printer
     program = write(
         plan.patch.toolpath, site.setup, title=title, resume=interruption, restore=False
     )
-    # what the job bridges counts where the checker has followed it itself
+    # the checker allows the job's own bridges only if it has followed the job itself
     bridges = lines.bridges if lines is not None else None
     patch = bridges if isinstance(bridges, JobBridges) else True
     try:
