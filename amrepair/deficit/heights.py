@@ -3,7 +3,7 @@
 The slicer lays beads onto it, and the checker keeps the head clear of it. A height is a robust mean
 of the topmost points in a column. A column that no ray reached counts as solid up to the printed
 height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points, the
-part is taken to stand as designed, with that margin, and nothing where the design is open.
+part is taken to stand as designed, with that margin, and nothing where it was designed open.
 """
 
 from __future__ import annotations
