@@ -27,7 +27,7 @@ class SkippedOptions:
     gone_share, sure_share
         A stretch is missing if it is this open on average, as told by the rays that meet its
         core, where −1 is its top, 0 half of its plastic, and 1 its floor. It is missing, too, if
-        half as many samples are open by `sure_share`, which is higher since they are fewer. Both are
+        half as many samples are open by `sure_share`, which is higher for fewer. Both are
         well above 0, since pixels beside a silhouette let rays run past a wall.
     gone_erring
         Takes the place of `gone_share` where the scanner errs. Of 114 sound looks, most at parts
