@@ -62,9 +62,9 @@ def best_plan(
 ) -> PatchPasses:
     """The best of several ways to lay a patch.
 
-    The ways differ in the heights at which hollows get extra passes (`Openings`). The next one is tried only where the
-    last leaves something open that the head could reach. A way that lays much of its plastic over
-    air beside rims is planned again without that.
+    The ways differ in the heights at which hollows get extra passes (`Openings`). The next one is
+    tried only where the last leaves something open that the head could reach. A way that lays much
+    of its plastic over air beside rims is planned again without that.
     """
     options = model.options.due
     open_mm3 = model.open_mm3(grid.layer_height_mm)
