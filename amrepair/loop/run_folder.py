@@ -22,7 +22,7 @@ from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.options import LoopOptions
 from amrepair.loop.pace import Pace
 from amrepair.policy import USUAL_POLICY, PolicyOptions
-from amrepair.regions.calibration import Calibration, as_tuples
+from amrepair.regions.error_calibration import Calibration, as_tuples
 from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template

@@ -26,7 +26,7 @@ from amrepair.loop.locate import (
 from amrepair.loop.looks import Stop
 from amrepair.loop.sequential_objects import finished_at, refuse_own_hits, template_of
 from amrepair.regions import detect
-from amrepair.regions.calibration import NORMAL_NOISE
+from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair import Detector, Site

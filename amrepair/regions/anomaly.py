@@ -13,7 +13,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration
 from amrepair.regions.inspected import Inspected
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions

@@ -18,14 +18,14 @@ from amrepair.frames import cells_of, in_box
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import fit_nuisance
 from amrepair.observe.options import BackgroundOptions
-from amrepair.regions.calibrating import (
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration_fit import (
     NONE_FAR_OFF,
     Sound,
     by_width,
     calibrated,
     sound_scales,
 )
-from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import Level, tested

@@ -10,8 +10,8 @@ from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
-from amrepair.regions.calibrating import Sound, sound_scales
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration_fit import Sound, sound_scales
 from amrepair.regions.inspected import Inspected, OffByJob, inspected_of, tolerances
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of

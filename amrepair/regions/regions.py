@@ -15,7 +15,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points, touching_mm
 from amrepair.frames import box_of
 from amrepair.regions.anomaly import DefectType, Label, Region
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.significance import Level
 from amrepair.template.port import Template

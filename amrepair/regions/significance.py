@@ -29,7 +29,7 @@ from amrepair.field import scales_kernels
 from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.frames import cells_of
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
 

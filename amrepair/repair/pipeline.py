@@ -28,7 +28,7 @@ from amrepair.frames import Transform, box_corners, box_of
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.bed import by_beds, of_bed
-from amrepair.regions.calibration import NORMAL_NOISE, of_touches
+from amrepair.regions.error_calibration import NORMAL_NOISE, of_touches
 from amrepair.regions.inspected import tolerances
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.systematic import PoseKnown

@@ -9,7 +9,7 @@ from amrepair.deficit import Deficit
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY, PolicyOptions, acceptance
 from amrepair.regions import AnomalyMap, Region
-from amrepair.regions.calibrating import Sound
+from amrepair.regions.error_calibration_fit import Sound
 from amrepair.scans import Scan
 from gcode.check import CheckedProgram
 from gcode.estimate import Estimate

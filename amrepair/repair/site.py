@@ -14,8 +14,8 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.regions import AnomalyMap, detect
-from amrepair.regions.calibrating import Sound
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
+from amrepair.regions.error_calibration_fit import Sound
 from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair.options import USUAL_REPAIR, RepairOptions
 from amrepair.scans import Scan

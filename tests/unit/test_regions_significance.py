@@ -15,9 +15,9 @@ from amrepair.cli.inspect import _refuse_too_noisy
 from amrepair.errors import InputError
 from amrepair.field.scales import RANK, WINDOW_FACING, scales_of
 from amrepair.regions import Label, detect
-from amrepair.regions.calibrating import calibrated
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration, FarOff
 from amrepair.regions.detection import judged_scales
+from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration, FarOff
+from amrepair.regions.error_calibration_fit import calibrated
 from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import Tail, as_normal, as_student

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
-from amrepair.regions.calibration import HALF_OCTAVE, Calibration, FarOffTold
+from amrepair.regions.error_calibration import HALF_OCTAVE, Calibration, FarOffTold
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import LEAST_PEAKS, Level
 
