@@ -41,9 +41,9 @@ from gcode.profiles import DEFAULT_PROCESS
 if TYPE_CHECKING:
     from amrepair.frames import Transform
     from amrepair.loop.afterwards import Afterwards
+    from amrepair.reorientation import Reorientation
     from amrepair.repair import RepairPlan, Site, Stopwatch
     from amrepair.template.port import Template
-    from amrepair.turning import Turn
     from gcode.profiles import PrintSetup
     from gcode.reader import Job
 
@@ -142,9 +142,9 @@ def repair(
         import numpy as np
 
         from amrepair.loop.afterwards import afterwards
+        from amrepair.reorientation import turns_named, turns_of
         from amrepair.repair import Stopwatch, plan_repair
         from amrepair.report import report_of_plan, write_report
-        from amrepair.turning import turns_named, turns_of
 
     turns = turns_named(turn or [])
     refuse_standing(standing)
@@ -175,7 +175,7 @@ def repair(
                 watch=watch,
                 progress=bars,
             )
-        ranked: tuple[Turn, ...] = ()
+        ranked: tuple[Reorientation, ...] = ()
         if turns and plan.unreachable_mm3 > WORTH_TURNING_RATIO * plan.deficit.missing_mm3:
             with watch("turns"):
                 ranked = turns_of(plan, site, turns, progress=bars)
@@ -320,7 +320,7 @@ def _say(
     plan: RepairPlan,
     result: dict[str, Any],
     output: Path,
-    ranked: tuple[Turn, ...],
+    ranked: tuple[Reorientation, ...],
     late: Afterwards | None,
     *,
     older: bool,
@@ -490,7 +490,7 @@ def _typed(placed: Transform) -> str:
     return f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}"
 
 
-def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:
+def _suggestion(plan: RepairPlan, ranked: tuple[Reorientation, ...]) -> list[str]:
     """The text that says which turns were tried and what each would reach."""
     if not ranked:
         return []
