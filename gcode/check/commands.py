@@ -78,12 +78,12 @@ class Commands(Motion):
             return None
 
     def _choose(self, tool: str) -> None:
-        """Each head, and each of several filaments to one nozzle, may be taken at any time.
+        """Change the head, or the filament of one nozzle; refused where the printer has only one.
 
-        The only tool may have any number. What changes the filament loads it behind our back, so
-        what was pulled back of the last one comes back as far as the next one is pushed here. A
-        head has its own heater and its own filament; where it is after a change the firmware and
-        the job's slicer know, who both take its height for what it was.
+        Where there is a single tool it may have any number. Filament changers load by themselves,
+        so that filament pulled back before a change comes back with the next push. A head has its
+        own heater and its own filament. After a change of heads X and Y are not known here, while
+        firmware and slicer both take Z to be what it was.
         """
         printer, pushed = self._setup.printer, self.moves.sums.pushed
         before = self._tool or ("T0" if pushed or printer.heads > 1 else tool)
@@ -107,9 +107,9 @@ class Commands(Motion):
         self._tool = tool
 
     def _meant(self, told: float | None) -> Hotend | None:
-        """The head whose heater a line means, by its number or none; None where it is not there.
+        """The head whose heater a line means, by a number or without one; None if there is none.
 
-        Of one heater the filament, or the only tool, may have its number.
+        Where there is one heater, the number may be that of the filament or of the only tool.
         """
         printer = self._setup.printer
         if told is None:
@@ -120,7 +120,7 @@ class Commands(Motion):
         return self._head if there or f"T{told:g}" in {"T0", self._tool} else None
 
     def _raised(self, what: str, value: str, limit: str, over_ratio: float) -> None:
-        """A limit of the machine's; what never arrives is refused in any job."""
+        """Judge a limit of the machine that a program raises; refuse an infinite one always."""
         gross = math.nextafter(math.inf, 0.0)
         self._beyond(what, value, limit, over_ratio, gross)
 
@@ -133,7 +133,7 @@ class Commands(Motion):
                 self._refuse("move past the end stops or of one motor", told, f"{letter}0")
 
     def _dwell(self, words: dict[str, float | None]) -> None:
-        """Waits add up as long as nothing moves between them."""
+        """Judge a wait; waits add up as long as nothing moves between them."""
         if self._waited_at != self.moves.told:
             self._waited_s, self._waited_at = 0.0, self.moves.told
         for letter, per_s in DWELLS.items():
@@ -183,7 +183,7 @@ class Commands(Motion):
                     self._refuse("shift of the coordinate system", f"{key}={given[key]}", "0 mm")
 
     def _scale(self, name: str, percent: float) -> None:
-        """A factor on all flow or speed from here on."""
+        """Set a factor on all flow or speed from here on."""
         what, low, high = FACTOR_LIMITS[name]
         if low <= percent <= high:
             self._factor[name] = percent / 100.0
@@ -191,7 +191,7 @@ class Commands(Motion):
             self._refuse(what, f"{percent:g} %", f"{low:g} to {high:g} %")
 
     def _heat(self, name: str, words: dict[str, float | None], *, of_two: bool = False) -> None:
-        """A heater's temperature; of two that a head has, `of_two`, or the only one."""
+        """Set a heater's temperature; with `of_two` not also that of a head that waits."""
         value_c = waits.told_c(words, self._dialect)
         what = HEATER_COMMANDS[name]
         for refusal in waits.for_cooling(name, what, words, self._dialect):
@@ -220,7 +220,7 @@ class Commands(Motion):
                 head.standby_c = value_c
 
     def _temperature(self, what: str, value_c: float | None) -> None:
-        """No chamber gets as hot as a bed."""
+        """Judge a temperature; a chamber's limit is the bed's."""
         printer = self._setup.printer
         limit_c = printer.max_bed_c if what in {"bed", "chamber"} else printer.max_hotend_c
         if value_c is not None and not 0 <= value_c <= limit_c:
@@ -260,7 +260,7 @@ class Commands(Motion):
             self._place[axis] = None  # the place of an end stop is the firmware's business
 
     def _homes_above(self, z_mm: float | None) -> None:
-        """X and Y are homed across the bed: above all that stands there."""
+        """Refuse homing X or Y, which crosses the bed, below the top of what stands there."""
         top_mm = self._top_mm
         if top_mm is None or (z_mm is None and self._standing_top_mm is None):
             return
@@ -269,7 +269,7 @@ class Commands(Motion):
             self._refuse("homing X or Y below the top of what stands there", told, f"{top_mm:g} mm")
 
     def _touch(self, words: dict[str, float | None]) -> None:
-        """The head is swept down to what it is to feel; words in mm and mm/min."""
+        """Judge a touch, and have the head swept down to it; words are in mm and mm/min."""
         planned = touches.planned_at(self._touches, self._place)
         wrong = touches.refusal_of(
             planned,
