@@ -33,7 +33,7 @@ from amrepair.frames import Transform
 from amrepair.loop.findings import findings
 from amrepair.loop.kinds import typed
 from amrepair.policy.table import Action, judge
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair import Site, plan_repair
 from amrepair.scans import ScanRequest
 from amrepair.simulate.flow import noisy_flow

@@ -1,7 +1,8 @@
 """The vocabulary of a print: what a nozzle does, before any dialect gives it words.
 
-A `Toolpath` is a sequence of moves in the build frame (bed corner at the origin, Z up, mm).
-It knows nothing of E values, feed words or firmware; `writer` does. A `Program` is final text.
+A `Toolpath` is a sequence of moves in the build frame (bed corner at the origin, Z up, mm). It
+knows nothing of E values, feed rates or firmware; `writer` turns it into a `Program`, which is the
+final text.
 """
 
 from __future__ import annotations
@@ -211,24 +212,26 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class ModalState:
-    """Where a machine stands between two lines of a program, and in which modes.
+    """The state of a machine between two lines of a program: position, temperatures and modes.
 
     Attributes
     ----------
     position_mm
-        (x, y, z) of the nozzle, build frame, whatever G92 made of the coordinates.
+        (x, y, z) of the nozzle in the build frame, regardless of any shift by G92.
     e_mm
-        Logical extruder position (what `G92 E` would have to say).
+        The logical extruder position, as `G92 E` would have to state it.
+    absolute_xyz, absolute_e
+        Whether coordinates, and E, are absolute (G90, M82) or relative (G91, M83).
     hotends_c, bed_c
-        Targets, °C, of each head's own heater; of several filaments to one nozzle there is one.
+        Target temperatures, °C, of each head's heater; several filaments to one nozzle share one.
     acceleration_mm_s2
-        Of printing moves; None where the program never set it.
+        The acceleration of printing moves; None where the program never set it.
     units_mm
-        False after G20.
+        False after G20 (inches).
     tool
-        The head, or the filament, that is chosen.
+        The head or filament that is chosen.
     pulled_mm
-        Its filament that is pulled back, mm: so much of the next push melts nothing.
+        How far its filament is pulled back, mm: the next push has to make this up first.
     """
 
     position_mm: tuple[float, float, float]
@@ -246,16 +249,16 @@ class ModalState:
 
     @property
     def hotend_c(self) -> float:
-        """Target of the head that is chosen."""
+        """The target temperature of the chosen head."""
         return self.hotends_c[self.heater]
 
     @property
     def heater(self) -> int:
-        """Which of the heaters is that of the head that is chosen."""
+        """The number of the chosen head's heater."""
         return self.tool if len(self.hotends_c) > 1 else 0
 
     def with_hotend(self, target_c: float) -> ModalState:
-        """The same with another target of the head that is chosen."""
+        """The same state with another target temperature of the chosen head."""
         told = list(self.hotends_c)
         told[self.heater] = target_c
         return replace(self, hotends_c=tuple(told))

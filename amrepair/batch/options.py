@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from amrepair.regions.calibration import Calibration
+    from amrepair.regions.error_calibration import Calibration
     from gcode.profiles import PrintSetup
 
 # Raised when results of the same name would come out differently: old ones are then not taken.

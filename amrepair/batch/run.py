@@ -39,7 +39,7 @@ from amrepair.batch.table import DONE, as_csv, as_parquet, row_of
 from amrepair.batch.work import PROGRAM, SUMS
 from amrepair.errors import InputError
 from amrepair.library import template_files
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
 from amrepair.template import GridSdf, PaperSdf, open_template
 from gcode.profiles import load_setup
 from gcode.progress import Progress, silent

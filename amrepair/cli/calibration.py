@@ -79,20 +79,22 @@ def calibrate_command(
 ) -> None:
     """Find where the scanner hangs; or learn from sound parts what it leaves on them."""
     with console.starting():
-        from amrepair.cli import calibrating, sound_parts
+        from amrepair.cli import error_calibration, pose_calibration
     if sound:
-        sound_parts.run(sound, template, name, scan_unit=scan_unit, seed=seed, as_json=as_json)
+        error_calibration.run(
+            sound, template, name, scan_unit=scan_unit, seed=seed, as_json=as_json
+        )
         return
     if template is not None or name is not None:
         raise InputError("--template and --name belong to --sound SCAN; name a sound part's scan")
 
     if target_gcode is not None:
-        calibrating.write_target(target_gcode, (printer, material, process), as_json=as_json)
+        pose_calibration.write_target(target_gcode, (printer, material, process), as_json=as_json)
         return
-    calibrating.run(
+    pose_calibration.run(
         output,
         (printer, material, process),
-        calibrating.Source(port, scanner, scan, job, layer, scan_timeout_s, scan_unit),
+        pose_calibration.Source(port, scanner, scan, job, layer, scan_timeout_s, scan_unit),
         max_residual_mm=max_residual_mm,
         seed=seed,
         as_json=as_json,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from amrepair.frames import Transform
-    from amrepair.regions.calibration import Calibration
+    from amrepair.regions.error_calibration import Calibration
     from gcode.profiles import PrintSetup
 
 Options = TypeVar("Options")
@@ -146,7 +146,7 @@ CalibrationOption = Annotated[
 
 def calibration_named(name: str | None) -> Calibration | None:
     """The calibration of that name, from the user's folder; None where none was named."""
-    from amrepair.regions.calibration import Calibration, users_folder
+    from amrepair.regions.error_calibration import Calibration, users_folder
 
     return None if name is None else Calibration.load(name, users_folder())
 

@@ -6,9 +6,9 @@ import math
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -40,13 +40,13 @@ from gcode.profiles import DEFAULT_PROCESS
 
 if TYPE_CHECKING:
     from amrepair.frames import Transform
-    from amrepair.repair import RepairPlan
+    from amrepair.loop.afterwards import Afterwards
+    from amrepair.reorientation import Reorientation
+    from amrepair.repair import RepairPlan, Site, Stopwatch
     from amrepair.template.port import Template
-    from amrepair.turning import Turn
     from gcode.profiles import PrintSetup
     from gcode.reader import Job
 
-# A guess from the user's own pose is refined; the scan may lie this far from it.
 FRAMES = ("build", "unknown")
 OF_JOB = "job"  # as --part-pose
 # Less than this share out of reach is not worth turning the part over.
@@ -128,20 +128,13 @@ def repair(
     as_json: JsonOption = False,
 ) -> None:
     """Make the G-code that prints only what is missing on a finished part."""
-    if scan_frame not in FRAMES:
-        raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
-    if pose == OF_JOB and job is None:
-        raise InputError("--part-pose job takes the place from the job; name it by --job JOB.gcode")
+    _refuse_contradicting_words(scan_frame, pose, job)
     damage_at_mm = _damage_at(damage_at, scan_frame)
     text = program_text(job) if job is not None else None
     setup, _ = job_setup(text, job or "", printer, material, process)
     _ = setup.printer.head  # refused before any work
     if scan_frame == "unknown" and pose is None:
-        hint = pose_of_job(job, template, setup)
-        raise InputError(
-            "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
-            f"the part stands on the bed; {hint}"
-        )
+        _refuse_without_pose(job, template, setup)
     bars = console.Bars()
     frame = "build" if scan_frame == "build" else "scanner"
     cloud = read_early(scan, frame, sensors(sensor_at), scan_unit, bars)
@@ -149,37 +142,22 @@ def repair(
         import numpy as np
 
         from amrepair.loop.afterwards import afterwards
-        from amrepair.loop.locate import BESIDE_THE_PART, of_roles
-        from amrepair.loop.looks import plan_stops
-        from amrepair.loop.sites import sites
-        from amrepair.repair import Site, Stopwatch, plan_repair
-        from amrepair.report import plan_is_enough, report_of_plan, summary_of_result, write_report
-        from amrepair.report.collect import plan_result
-        from amrepair.report.text import left_out_lines
-        from amrepair.template import open_template
-        from amrepair.turning import turns_named, turns_of
+        from amrepair.reorientation import turns_named, turns_of
+        from amrepair.repair import Stopwatch, plan_repair
+        from amrepair.report import report_of_plan, write_report
 
     turns = turns_named(turn or [])
     refuse_standing(standing)
     for path in filter(None, (output, report)):
         console.writable(path)
-    placed = part_pose(pose) if pose is not None and pose != OF_JOB else None
+    told_pose = part_pose(pose) if pose is not None and pose != OF_JOB else None
     known_errors = calibration_named(calibration)
     watch = Stopwatch()
     with bars.shown():
         with bars.stage("read"):
             read_job = job_of(job, setup) if job is not None else None
-            grid = grid_of(read_job, setup)
-        with watch("template"):
-            field = open_template(template, progress=bars)
-        alone = read_job is None or not of_roles(read_job.beads, BESIDE_THE_PART).any()
-        if pose == OF_JOB and read_job is not None:
-            with watch("locate"):
-                field, placed = where_the_job_prints_it(read_job, f"{job}", field, setup)
-        guess = placed.inverse() if placed is not None and frame == "build" else None
-        site = Site(field, setup, grid, placed if frame == "scanner" else None)
-        if pose == OF_JOB and read_job is not None and placed is not None:
-            site = sites(read_job, field, placed, setup)(plan_stops(read_job, ())[-1])
+        where = _Where(frame, told_pose, job, read_job, by_job=pose == OF_JOB)
+        field, site, guess = _site_of(template, where, setup, watch, bars)
         site = replace(
             site,
             on_fixture=on_fixture,
@@ -187,7 +165,7 @@ def repair(
             damage_at_mm=damage_at_mm,
             calibration=known_errors,
         )
-        with _told_of_supports(None if alone or pose == OF_JOB else job):
+        with _told_of_supports(where.job_with_supports):
             plan = plan_repair(
                 cloud,
                 site,
@@ -197,7 +175,7 @@ def repair(
                 watch=watch,
                 progress=bars,
             )
-        ranked: tuple[Turn, ...] = ()
+        ranked: tuple[Reorientation, ...] = ()
         if turns and plan.unreachable_mm3 > WORTH_TURNING_RATIO * plan.deficit.missing_mm3:
             with watch("turns"):
                 ranked = turns_of(plan, site, turns, progress=bars)
@@ -206,31 +184,12 @@ def repair(
             with watch("ways"):
                 command = _that_goes_on(f"{job}", output, printer, material)
                 late = afterwards(plan, read_job, field, setup, command=command)
-    program = plan.checked.program if plan.checked is not None else None
-    if program is not None:
-        text = program.text
-        console.write_text(output, text)
-    older = program is None and output.exists()
-    if older:  # `repair && send` must not send what another scan asked for
-        output.unlink()
+    older = _save_program(plan, output)
     if standing is not None:
         console.write_whole(standing, plan.deficit.as_built.write)
-    seconds = watch.rounded_s()
-    result = plan_result(
-        plan,
-        gcode=str(output) if program is not None else None,
-        seed=seed,
-        seconds=seconds,
-        setup=setup,
-        late=late,
-    )
-    result |= {
-        "clutter_ratio": plan.registration.clutter_ratio,
-        "foot_z_mm": round(_foot_z_mm(field, plan), 3),
-    }
+    result = _result_of(plan, output, field, setup, late, seed, watch.rounded_s())
     if turns:
         result["turns"] = [asdict(one) for one in ranked]
-    within = plan_is_enough(plan)
     if report is not None:
         with bars.shown(), bars.stage("report"):
             data = report_of_plan(
@@ -243,6 +202,135 @@ def repair(
                 late=late,
             )
             console.write_whole(report, lambda path: write_report(data, path))
+    _say(plan, result, output, ranked, late, older=older, as_json=as_json)
+
+
+def _refuse_contradicting_words(scan_frame: str, pose: str | None, job: Path | None) -> None:
+    """Refuse what the words alone show to be wrong, before any file is read."""
+    if scan_frame not in FRAMES:
+        raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
+    if pose == OF_JOB and job is None:
+        raise InputError("--part-pose job takes the place from the job; name it by --job JOB.gcode")
+
+
+def _refuse_without_pose(job: Path | None, template: Path, setup: PrintSetup) -> NoReturn:
+    """Refuse a scan in the scanner's frame of which nobody says where the part stands."""
+    hint = pose_of_job(job, template, setup)
+    raise InputError(
+        "--scan-frame unknown needs --part-pose X,Y,Z,RZ: an aligned shape does not say where "
+        f"the part stands on the bed; {hint}"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Where:
+    """What the command's words say of where the part stands.
+
+    Attributes
+    ----------
+    frame
+        The scan's own: `build`, or `scanner`.
+    placed
+        The pose that was typed, build from template; None where none was.
+    path, job
+        The job that was named, and as it was read; None where none was.
+    by_job
+        The part stands where the job printed it, with all that was printed beside it.
+    """
+
+    frame: str
+    placed: Transform | None
+    path: Path | None
+    job: Job | None
+    by_job: bool
+
+    @property
+    def job_with_supports(self) -> Path | None:
+        """The job, if it lays more than the part and nobody has said that this still stands."""
+        from amrepair.loop.locate import BESIDE_THE_PART, of_roles
+
+        if self.job is None or self.by_job:
+            return None
+        return self.path if of_roles(self.job.beads, BESIDE_THE_PART).any() else None
+
+
+def _site_of(
+    template: Path, where: _Where, setup: PrintSetup, watch: Stopwatch, bars: console.Bars
+) -> tuple[Template, Site, Transform | None]:
+    """The template as it stands on the bed, what the scan is held against, and a guess at the pose.
+
+    The guess is template from scan; None where alignment has to find the pose by itself.
+    """
+    from amrepair.loop.looks import plan_stops
+    from amrepair.loop.sites import sites
+    from amrepair.repair import Site
+    from amrepair.template import open_template
+
+    grid = grid_of(where.job, setup)
+    with watch("template"):
+        field = open_template(template, progress=bars)
+    placed = where.placed
+    if where.by_job and where.job is not None:
+        with watch("locate"):
+            field, placed = where_the_job_prints_it(where.job, f"{where.path}", field, setup)
+    guess = placed.inverse() if placed is not None and where.frame == "build" else None
+    if where.by_job and where.job is not None and placed is not None:
+        return field, sites(where.job, field, placed, setup)(plan_stops(where.job, ())[-1]), guess
+    return field, Site(field, setup, grid, placed if where.frame == "scanner" else None), guess
+
+
+def _save_program(plan: RepairPlan, output: Path) -> bool:
+    """Write the repair's program; without one, remove an older file. Whether one was removed."""
+    if plan.checked is not None:
+        console.write_text(output, plan.checked.program.text)
+        return False
+    older = output.exists()
+    if older:  # `repair && send` must not send what another scan asked for
+        output.unlink()
+    return older
+
+
+def _result_of(
+    plan: RepairPlan,
+    output: Path,
+    template: Template,
+    setup: PrintSetup,
+    late: Afterwards | None,
+    seed: int,
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """The result that --json prints and that the report is made of."""
+    from amrepair.report.collect import plan_result
+
+    result = plan_result(
+        plan,
+        gcode=str(output) if plan.checked is not None else None,
+        seed=seed,
+        seconds=seconds,
+        setup=setup,
+        late=late,
+    )
+    return result | {
+        "clutter_ratio": plan.registration.clutter_ratio,
+        "foot_z_mm": round(_foot_z_mm(template, plan), 3),
+    }
+
+
+def _say(
+    plan: RepairPlan,
+    result: dict[str, Any],
+    output: Path,
+    ranked: tuple[Reorientation, ...],
+    late: Afterwards | None,
+    *,
+    older: bool,
+    as_json: bool,
+) -> None:
+    """Print the result, as JSON or in sentences, and exit with 3 where something is left."""
+    from amrepair.report import plan_is_enough, summary_of_result
+    from amrepair.report.text import left_out_lines
+
+    within = plan_is_enough(plan)
     if as_json:
         console.show_json(result)
     else:
@@ -402,7 +490,7 @@ def _typed(placed: Transform) -> str:
     return f"{x:.3f},{y:.3f},{z:.3f},{turn_deg:.2f}"
 
 
-def _suggestion(plan: RepairPlan, ranked: tuple[Turn, ...]) -> list[str]:
+def _suggestion(plan: RepairPlan, ranked: tuple[Reorientation, ...]) -> list[str]:
     """The text that says which turns were tried and what each would reach."""
     if not ranked:
         return []

@@ -27,14 +27,14 @@ from amrepair.loop import (
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
-from amrepair.loop.in_turn import refuse_own_hits
 from amrepair.loop.locate import is_upright, locate_parts, stood
-from amrepair.loop.marks import marked_stops
+from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.options import UNASKED
 from amrepair.loop.pace import layers_at, layers_every
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.probing import ProbeScanner
-from amrepair.loop.setting import Setting, forget, keep, open_run
+from amrepair.loop.run_folder import Setting, forget, keep, open_run
+from amrepair.loop.sequential_objects import refuse_own_hits
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
 from amrepair.regions import detect

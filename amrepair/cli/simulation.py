@@ -182,7 +182,7 @@ def _recorded(
 ) -> Tape:
     """Write down what the run begins with; the tape that it is recorded on."""
     from amrepair.loop import Tape
-    from amrepair.loop.setting import Setting, forget, keep
+    from amrepair.loop.run_folder import Setting, forget, keep
 
     forget(folder.path)
     setting = Setting.of(

@@ -11,7 +11,7 @@ from amrepair.errors import LoopError
 from amrepair.loop import LoopReport, Tape
 from amrepair.loop.learning import told
 from amrepair.loop.probing import Felt
-from amrepair.loop.setting import Recorded
+from amrepair.loop.run_folder import Recorded
 from amrepair.repair import Stopwatch
 from amrepair.report import TemperatureSeries, report_of_loop, summary_of_result, write_report
 from amrepair.report.collect import loop_result, rounded

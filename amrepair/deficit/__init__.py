@@ -1,6 +1,9 @@
 """Deficit: watertight solids of what is missing and what is too much, in the build frame.
 
-It turns a detected difference into geometry with a tolerance; it does not decide what to print.
+The room turns regions that detection found into solids, and makes the height field of what stands
+on the bed. It does not decide what to print. `compute.compute_deficit` is the whole algorithm:
+`boxes` says where solids are made, `voxels` samples distances there, `solids` makes closed meshes;
+`heights`, `walls` and `line_heights` say what stands.
 """
 
 from amrepair.deficit.compute import AsBuilt, Deficit, Standing, compute_deficit, measured_regions

@@ -1,6 +1,6 @@
-"""Where solids are to be made: boxes around what detection labelled, and how deep it lies.
+"""Boxes in which solids are made: around what detection labelled, with its depth.
 
-They hold a void's walls and mouth too, which nobody sampled; what is solid there `solids` says.
+A box also has to hold a void's walls and mouth, where the scan has no points.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from amrepair.field.as_built import Evidence
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.frames import box_of, boxes_meet, cells_of, diagonal
 from amrepair.regions import AnomalyMap, Label
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.template.port import Template
 
 
 @dataclass(frozen=True, slots=True)
 class Sought:
-    """What solids of one label are made from, template frame.
+    """All that solids of one label (missing or excess) are made from, template frame.
 
     Attributes
     ----------
     gone
-        Lines of the job that are not there; None where there are none, and for excess. There rays
-        speak: the nearest planes are those of what lies below and beside, and stand as designed.
+        Missing lines of the job; None where there are none, and for excess. Around them only rays
+        count: the surfaces next to a missing line belong to the lines below and beside it.
     """
 
     template: Template
@@ -40,43 +40,43 @@ class Sought:
 
     @property
     def tau_mm(self) -> float:
-        """What is no farther from the template counts only by its label."""
+        """τ: nearer to the template than this, only what detection labelled counts."""
         return self.anomaly.threshold_mm
 
     @property
     def is_excess(self) -> bool:
-        """Too much, not missing."""
+        """Whether this is about excess rather than missing material."""
         return self.label is Label.EXCESS
 
     @property
     def sign(self) -> float:
-        """Of the template's distance where there may be any: negative inside."""
+        """Sign of the template's distance where such material may be: negative inside."""
         return 1.0 if self.is_excess else -1.0
 
     @property
     def labelled(self) -> Mask:
-        """(s,) surfels that the test found."""
+        """(s,) whether detection gave each surfel this label."""
         return np.asarray(np.asarray(self.anomaly.surfel_label) == int(self.label))
 
     @property
     def surface_mm(self) -> Points:
-        """(g, 3) places of the template's surface that the test found."""
+        """(g, 3) points of the template's surface with this label."""
         return self.anomaly.template_points_mm[self.anomaly.template_label == int(self.label)]
 
     def told_mm(self, inside: Mask) -> Float[np.ndarray, "p 3"]:
-        """(p, 3) places that are known to be missing: some surfels, surface, lines of the job."""
+        """(p, 3) places known to be missing: the given surfels, template points, missing lines."""
         told = [self.evidence.surfels.place_mm[inside], self.surface_mm]
         if self.gone is not None:
             told.append(self.gone.samples_mm(self.options.skipped.sample_step_mm))
         return np.concatenate(told)
 
     def nearest_is_labelled(self, samples_mm: Points) -> Mask:
-        """(k,) whether the test found the surfel nearest to each place."""
+        """(k,) whether the surfel nearest to each place has this label."""
         nearest = self.evidence.surfels.tree.nearest_one(samples_mm)
         return np.asarray(self.labelled[nearest])
 
     def allowed_mm(self, samples_mm: Points, asked: Mask) -> Values:
-        """(k,) how far out of the template nothing is too much, by the nearest surfel."""
+        """(k,) how far outside the template material is allowed, by the nearest surfel."""
         allowed_mm = np.zeros(len(samples_mm))
         higher_mm = self.anomaly.surfel_higher_mm
         if self.is_excess and higher_mm is not None and (higher_mm > 0).any():
@@ -87,24 +87,24 @@ class Sought:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """(2, 3) its lowest and highest corner, and how thick what lies in it is."""
+    """A box by its (2, 3) lowest and highest corner, and how thick the defect in it is."""
 
     corners_mm: Float[np.ndarray, "2 3"]
     depth_mm: float
 
     @classmethod
     def around(cls, places_mm: Points, margin_mm: float, depth_mm: float) -> Box:
-        """With a margin."""
+        """The box around places, with a margin."""
         return cls(box_of(places_mm) + margin_mm * np.array([[-1.0], [1.0]]), depth_mm)
 
     def joined(self, other: Box) -> Box:
-        """One around both, as fine as the finer of them needs."""
+        """The box around two boxes, as finely sampled as the finer of them."""
         both_mm = np.concatenate([self.corners_mm, other.corners_mm])
         return Box(box_of(both_mm), min(self.depth_mm, other.depth_mm))
 
 
 def boxes_of(sought: Sought) -> list[Box]:
-    """Around each group of labelled cells and template points, and around lines that are gone."""
+    """Boxes around each group of labelled cells and template points, and around missing lines."""
     s, options = sought.evidence.surfels, sought.options.voxels
     which = np.flatnonzero(sought.labelled)
     if sought.is_excess:
@@ -137,9 +137,9 @@ def boxes_of(sought: Sought) -> list[Box]:
 
 
 def _films(sought: Sought, which: Numbers) -> Mask:
-    """Cells of an even surface over which a film is missing: no deeper, and it faces out of it.
+    """Which cells lie under a missing film: shallow, even, and facing out of the template.
 
-    What is left of a thin roof lies as near to the template's surface, but to its other side.
+    The rest of a thin roof also lies near to the template's surface, but faces the other way.
     """
     s, options = sought.evidence.surfels, sought.options.voxels
     depth_mm, wide_mm = np.abs(s.deviation_mm[which]), np.abs(s.wide_mean(s.deviation_mm, which))
@@ -151,9 +151,9 @@ def _films(sought: Sought, which: Numbers) -> Mask:
 
 
 def _paths_out(sought: Sought, which: Numbers) -> Float[np.ndarray, "p 3"]:
-    """Points through the empty space from a void's floor to where it leaves the template.
+    """Points on straight lines through empty space, from a void's floor to outside the template.
 
-    They tie the floor to the mouth where nobody sampled the walls between.
+    They connect the floor with the mouth where the scan has no points on the walls between.
     """
     s, step_mm = sought.evidence.surfels, sought.options.voxels.path_step_mm
     first = np.unique(cells_of(s.place_mm[which], 0.0, step_mm), axis=0, return_index=True)[1]
@@ -172,7 +172,7 @@ def _paths_out(sought: Sought, which: Numbers) -> Float[np.ndarray, "p 3"]:
 
 
 def _merged(boxes: list[Box]) -> list[Box]:
-    """Boxes that overlap become one, so that no volume is made twice."""
+    """Join boxes that overlap, so that no volume is made twice."""
     apart: list[Box] = []
     for box in boxes:
         whole = box

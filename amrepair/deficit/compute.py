@@ -1,9 +1,10 @@
-"""The deficit: template minus as-built, with a tolerance, as solids in the build frame.
+"""The deficit: template minus as-built part, with a tolerance, as solids in the build frame.
 
-Template minus scan leaves a thin connected shell of noise. So the distance field of the template
-is eroded by τ, the as-built part is subtracted, and what is left is grown back and clipped to
-template minus as-built. What is thinner than τ counts only where detection's
-averages say so. Empty space counts only where a ray crossed it or scanned surface bounds it.
+Simply subtracting the scanned part from the template would leave a thin shell of noise all around.
+So the template is eroded by the tolerance τ, the as-built part is subtracted from that, and what is
+left is grown back and clipped to template minus as-built. Missing material thinner than τ counts
+only where detection found it significant. Space counts as empty only where a ray crossed it or
+scanned surface bounds it.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from amrepair.field.groups import area_per_point
 from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
 from amrepair.regions import AnomalyMap, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.regions.regions import classify
-from amrepair.regions.skipped import PlannedBeads, skipped
+from amrepair.regions.skipped import skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.meshes import box_of_solid
@@ -38,9 +40,10 @@ from gcode.surfaces import HeightField
 
 
 class Standing:
-    """Heights that are made when they are first asked for: a clean layer needs none.
+    """The heights of what stands on the bed, computed when first asked for.
 
-    What makes them is let go of once it has.
+    A layer without defects never asks for them. Once they are made, what they were made from is
+    released.
     """
 
     def __init__(self, make: Callable[[], HeightField]) -> None:
@@ -57,14 +60,15 @@ class Standing:
 
 @dataclass(frozen=True, slots=True)
 class AsBuilt:
-    """How what stands on the bed is made, where the caller knows more than one scan and solids.
+    """How to compute what stands on the bed, where the caller knows more than scan and solids.
 
     Attributes
     ----------
     seen
-        Makes the scan's heights, which wait for no solid.
+        Makes the heights that the scan shows.
     standing
-        Makes of them and of what is missing (build frame) what stands there (`standing_in_job`).
+        Makes what stands there from those heights and the missing solid, build frame
+        (`standing_in_job`).
     """
 
     seen: Callable[[], HeightField]
@@ -80,18 +84,18 @@ class Deficit:
     missing, excess
         Watertight `manifold3d.Manifold`s, possibly empty.
     regions
-        One per defect, boxes in the build frame, missing first, largest first. Those below what
-        one bead can fix are in the list (`below_bead`) and in the solids.
+        One for each piece, with boxes in the build frame; missing before excess, the largest
+        first. Pieces too small for a bead are listed too (`below_bead`), and are in the solids.
     tolerance_mm
-        τ: the erosion that was used.
+        τ, by which the template was eroded.
     unseen_area_mm2
-        Template surface that nothing is known of.
+        Area of the template's surface that no sensor saw.
     stands
-        Makes `as_built`, when that is first asked for.
+        Makes `as_built` when that is first asked for.
     gone
-        Stretches of planned lines that are not there, template frame.
+        Stretches of the job's lines that are missing, template frame.
     options
-        That it was made with.
+        The options that were used.
     """
 
     missing: manifold3d.Manifold
@@ -105,17 +109,17 @@ class Deficit:
 
     @property
     def as_built(self) -> HeightField:
-        """What stands on the bed; unseen cells are solid as `as_built_heights` says."""
+        """The heights of what stands on the bed; unseen columns count as solid (`heights`)."""
         return self.stands()
 
     @property
     def missing_mm3(self) -> float:
-        """Volume missing."""
+        """The missing volume."""
         return float(self.missing.volume())
 
     @property
     def excess_mm3(self) -> float:
-        """Volume in excess."""
+        """The volume of what is too much."""
         return float(self.excess.volume())
 
 
@@ -131,23 +135,23 @@ def compute_deficit(
     options: DeficitOptions = USUAL_DEFICIT,
     progress: Progress = silent,
 ) -> Deficit:
-    """Solids of what is missing and in excess.
+    """Make solids of what is missing and of what is too much.
 
     Parameters
     ----------
     scan
         In the template's frame.
     anomaly
-        What `detect` said about this scan; None runs it with its defaults.
+        The result of `detect` for this scan; None runs `detect` with its defaults.
     build_from_template
         Where the part stands on the bed.
     printed_z_mm
-        Height printed so far, build frame; None is the template's own top.
+        The height printed so far, build frame; None takes the template's own top.
     as_built
-        What makes what stands on the bed; None has it made of scan and solids.
+        How to compute what stands on the bed; None computes it from the scan and the solids.
     beads
-        What the job has laid there, template frame: lines of it that rays went through are missing,
-        however near to the template's surface they lie.
+        The job's topmost lines, template frame. Lines that rays went through are missing, however
+        near to the template's surface they lie.
 
     Raises
     ------
@@ -207,7 +211,7 @@ def _evidence_of(
     beads: PlannedBeads | None,
     options: SkippedOptions,
 ) -> tuple[Evidence, PlannedBeads | None]:
-    """What is known of space, also around lines of the job that are gone; and those lines."""
+    """The evidence, completed around lines of the job that are missing; and those lines."""
     evidence = anomaly.evidence
     assert evidence is not None
     if beads is None or not len(beads.width_mm):
@@ -224,7 +228,7 @@ def _evidence_of(
 def _in_build_frame(
     pieces: Sequence[manifold3d.Manifold], build_from_template: Transform
 ) -> manifold3d.Manifold:
-    """Pieces, template frame, as one solid that stands on the bed; possibly empty."""
+    """Join pieces, template frame, to one solid in the build frame; possibly empty."""
     whole = manifold3d.Manifold.batch_boolean(list(pieces), manifold3d.OpType.Add)
     return build_from_template.solid(whole)
 
@@ -240,7 +244,7 @@ def _standing(
     deviation_mm: Values,
     options: DeficitOptions,
 ) -> HeightField:
-    """What stands on the bed: the scan's heights, with the solids' walls and the points' own."""
+    """The heights of what stands: the scan's, with sharper walls from solids and points."""
     expected = build_from_template.solid(template.solid())
     solid, lost_mm, designed_mm = standing_heights(seen, expected, missing, excess, options.heights)
     points_mm, spacing_mm = build_from_template.apply(scan.points_mm), evidence.spacing_mm
@@ -252,15 +256,16 @@ def _standing(
 
 
 def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...]:
-    """What `detect` found, measured by solids; the largest first, boxes in the template frame.
+    """The regions that `detect` found, with volumes and boxes measured on the solids.
 
-    A surface alone tells little of how much is missing over it: of a deep notch 0.7. Depths stay
-    the largest deviation; what no solid was made of stays as its surface has it.
+    Area times depth on the scanned surface underestimates a volume: of a deep notch it gives 0.7.
+    Depths remain the largest deviation, and a region of which no solid was made remains as it was.
+    The largest region comes first; boxes are in the template frame.
 
     Parameters
     ----------
     deficit
-        Of the same anomaly, with a build frame that is the template's.
+        Of the same anomaly, computed with the template's frame as build frame.
     """
     pieces: dict[int, list[Region]] = {k: [] for k in range(-1, len(anomaly.regions))}
     for piece in deficit.regions:
@@ -291,14 +296,14 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
 
 
 def _roughly_missing(anomaly: AnomalyMap, evidence: Evidence) -> float:
-    """Volume under the surfels that are labelled missing, mm³."""
+    """A rough volume of what is missing, mm³: area times depth of the labelled surfels."""
     s = evidence.surfels
     mine = np.asarray(anomaly.surfel_label) == int(Label.MISSING)
     return float(np.abs(s.deviation_mm[mine]).sum()) * s.cell_mm**2
 
 
 def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Transform) -> Region:
-    """Measures of one piece; its box in the build frame."""
+    """Measure one piece; its box is in the build frame."""
     label, template = sought.label, sought.template
     bounds = box_of_solid(piece)
     volume = float(piece.volume())
@@ -317,7 +322,7 @@ def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Tra
 
 
 def _is_skipped(box_mm: Float[np.ndarray, "2 3"], gone: PlannedBeads | None) -> bool:
-    """Whether the middle of a line that is gone lies in a piece's box, template frame."""
+    """Whether the middle of a missing line lies in a piece's box, template frame."""
     if gone is None:
         return False
     middle = 0.5 * (gone.start_mm + gone.end_mm)
@@ -326,6 +331,6 @@ def _is_skipped(box_mm: Float[np.ndarray, "2 3"], gone: PlannedBeads | None) -> 
 
 
 def _unseen_area(anomaly: AnomalyMap) -> float:
-    """Area of the unseen template points, from their mean spacing."""
+    """The area of the unseen template points, from their mean spacing."""
     count = int((anomaly.template_label == int(Label.UNSEEN)).sum())
     return count * area_per_point(anomaly.template_points_mm)

@@ -1,8 +1,9 @@
-"""The as-built height field: what stands on the bed, for the slicer and the checker.
+"""The as-built height field: how high something stands at each place of the bed.
 
-Heights are robust means of what was seen from above. What no ray reached is solid up to the printed
-height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points the
-part stands as it was designed, and that margin; where it was designed open, nothing does.
+The slicer lays beads onto it, and the checker keeps the head clear of it. A height is a robust mean
+of the topmost points in a column. A column that no ray reached counts as solid up to the printed
+height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points, the
+part is taken to stand as designed, with that margin, and nothing where it was designed open.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
 AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
-# Ways to the columns about a point; most points lie on their own, and are asked no more.
+# Directions to the columns around a point; its own comes first, and suffices for most points.
 OWN_COLUMN_FIRST = sorted(itertools.product((-1.0, 0.0, 1.0), repeat=2), key=np.linalg.norm)
 
 
@@ -44,13 +45,13 @@ def as_built_heights(
     images: tuple[RangeImage, ...] = (),
     options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> HeightField:
-    """Height field of the scan, build frame.
+    """Make the height field that a scan shows, build frame.
 
     Parameters
     ----------
     images
-        The scan's range images, template frame: what nobody saw, as the bottom of a deep hole, is
-        solid no higher than rays crossed it.
+        The scan's range images, template frame. Where no point was seen, as at the bottom of a
+        deep hole, a column counts as solid only up to where rays crossed it.
     """
     points = build_from_template.apply(scan.points_mm)
     corners = box_corners(template.bounds_mm)
@@ -87,7 +88,7 @@ def _crossed(
     images: tuple[RangeImage, ...],
     options: HeightOptions,
 ) -> HeightMap:
-    """Heights lowered, column by column from above, as far as rays went through them."""
+    """Lower the unseen columns, from above, as far down as rays went through them."""
     iy, ix = np.nonzero(~solid.seen)
     z_mm, (x_mm, y_mm) = solid.z_mm.copy(), solid.centres_mm()
     high_mm = float(z_mm.max()) - max(low_mm, 0.0)
@@ -110,29 +111,30 @@ def standing_heights(
     excess: manifold3d.Manifold,
     options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> tuple[HeightField, HeightMap, HeightMap]:
-    """The as-built field with sharp walls; what is missing from each column; what was wanted.
+    """Sharpen the walls of a scan's height field with the solids, build frame.
 
-    What was expected, less what is missing, with what is too much, gives heights on a fine grid.
-    They stand beside walls, where the scan saw nothing higher (`seen`, by `as_built_heights`);
-    elsewhere the scan itself decides. All is in the build frame.
+    The expected solid, less what is missing and plus what is too much, gives heights on a fine
+    grid. They are taken beside walls, where the scan's coarse cells (`seen`, of `as_built_heights`)
+    saw nothing higher; everywhere else the scan decides.
 
     Returns
     -------
-    The field; from end to end how much is missing of each of its columns; their tops as expected.
+    The field; from end to end how much is missing in each of its columns; and each column's top as
+    expected.
     """
     fine = fine_over(seen, options)
     ny, nx = fine.shape
     whole, lost = (columns_of(solid, fine)[:2] for solid in (expected, missing))
     z_mm = raster_kernels.column_rest(*whole, *lost, options.film_mm, 0.0).reshape(ny, nx)
     at = cells_over(seen, fine)
-    # a film that the scan sees, around there too, is what is left of the part
+    # a thin film is kept where the scan sees it and its surroundings: it is left of the part
     films = raster_kernels.column_rest(*whole, *lost, options.least_film_mm, 0.0).reshape(ny, nx)
-    # a few cells without a point on it among others are chance
+    # a few cells without a point among others that have some are chance
     sampled = ndimage.grey_closing(np.where(seen.seen, seen.z_mm, 0.0), options.chance_cells)
     z_mm = np.where(ndimage.minimum_filter(sampled, 3)[at] > films - options.trust_mm, films, z_mm)
     gone = (lost[0][1:] != lost[0][:-1]).reshape(ny, nx)
     if gone.any():
-        # where fins are looked for, and as far again as they are told from there
+        # fins are looked for near the missing solid, in a window with room around for the filters
         rows, columns = window_around(gone, 3 * options.unseen_fin_cells)
         seen_mm = ndimage.maximum_filter(np.where(seen.seen, seen.z_mm, -np.inf), 3)
         seen_mm = seen_mm[at[0][rows], at[1][:, columns]]
@@ -150,7 +152,7 @@ def standing_heights(
 
 
 def fine_over(seen: HeightField, options: HeightOptions) -> HeightField:
-    """An empty field over the same, in cells as fine as there may be so many of."""
+    """An empty field over the same area, in cells as fine as their allowed number permits."""
     box = seen.box_mm
     area_mm2 = (box[2] - box[0]) * (box[3] - box[1])
     cell_mm = max(options.fine_cell_mm, float(np.sqrt(area_mm2 / options.most_fine_cells)))
@@ -163,7 +165,7 @@ def fine_over(seen: HeightField, options: HeightOptions) -> HeightField:
 def _sharpened(
     seen: HeightField, fine: HeightField, z_mm: HeightMap, gone: ColumnMask, options: HeightOptions
 ) -> HeightField:
-    """Heights of the scan on a fine grid, beside walls those of what was planned (`z_mm`)."""
+    """The scan's heights on a fine grid, and beside walls those of the solids (`z_mm`)."""
     at = cells_over(seen, fine)
     # a cell of the scan is as high as the highest thing that touches it: true of floors, not
     # beside walls, where the solids are the sharper of the two unless something else stands there
@@ -216,12 +218,13 @@ def with_what_stands_out(
     spacing_mm: float,
     options: HeightOptions,
 ) -> HeightField:
-    """Raised to the points that its surface does not explain by the scan's noise.
+    """Raise the field to points that stand out of it by more than the scan's noise.
 
-    Solids round off lips, and cells average what is in them: a crest, a splinter or a burr thinner
-    than the scan's spacing reads low, by up to its height. No bead can be laid on it, but the head
-    may run into it. A point is explained if the field, as near to it as noise moves points aside,
-    is as high. One that is alone is a reflection in mid-air. Points are in the build frame.
+    Solids round off lips, and cells average over what is in them, so a crest, a splinter or a burr
+    thinner than the point spacing reads too low. No bead is laid on it, but the head may run into
+    it. A point does not stand out if the field is as high within the distance that noise moves a
+    point aside. A single point with no others around is a reflection in mid-air and ignored. Points
+    are in the build frame.
     """
     off_mm = options.off_sigma * sigma_mm
     out = points_mm[
@@ -243,7 +246,7 @@ def with_what_stands_out(
 
 
 def with_others(field: HeightField, others: HeightField) -> HeightField:
-    """A field, and what stands in another one far beside it: one field over both, in its cells."""
+    """Join a field with what stands in another one beside it, in the cells of the first."""
     rows, columns = np.nonzero(others.z_mm > 0.0)
     if not len(rows):
         return field
@@ -267,24 +270,27 @@ def with_others(field: HeightField, others: HeightField) -> HeightField:
 def _without_rims_fins(
     z_mm: HeightMap, gone: ColumnMask, seen_mm: HeightMap, options: HeightOptions
 ) -> HeightMap:
-    """Lower what is too thin to be there beside what is missing; `seen_mm` is the highest seen."""
-    # a fin that no bead is thin enough for is the solids' rounding beside what was taken away
+    """Lower fins beside what is missing that are too thin to be there.
+
+    `seen_mm` is the highest point that was seen around each column.
+    """
+    # right beside the missing solid, a fin thinner than a bead is that solid's rounding
     beside = ndimage.maximum_filter(gone, 3)
     z_mm = np.where(beside, _without_fins(z_mm, options.fin_cells), z_mm)
-    # nor is one there that no wall is thin enough for, and of which no point was seen
+    # a little farther off, a fin thinner than a wall is there only if points of it were seen
     near = ndimage.maximum_filter(gone, 2 * options.unseen_fin_cells - 1)
     unseen = near & (seen_mm < z_mm - options.trust_mm)
     return np.where(unseen, _without_fins(z_mm, options.unseen_fin_cells), z_mm)
 
 
 def _without_fins(z_mm: HeightMap, cells: int) -> HeightMap:
-    """Lower what is thinner than so many cells; corners of what is thicker stay."""
+    """Lower what is thinner than so many cells, but keep the corners of what is thicker."""
     thick_mm = ndimage.grey_opening(z_mm, cells)
     return np.asarray(np.minimum(z_mm, ndimage.maximum_filter(thick_mm, 3)))
 
 
 def _by_chance(off_mm: HeightMap, around: int, options: HeightOptions) -> ColumnMask:
-    """Cells of few points: off by more than noise of many, but not off with those around them."""
+    """Cells that are off by chance, for having few points: those around them are not off, too."""
     bounded = np.clip(off_mm, -options.chance_mm, options.chance_mm)
     together = ndimage.uniform_filter(bounded, around)
     return np.asarray(
@@ -295,9 +301,9 @@ def _by_chance(off_mm: HeightMap, around: int, options: HeightOptions) -> Column
 def without_missing(
     seen: HeightField, missing: manifold3d.Manifold, options: HeightOptions = USUAL_DEFICIT.heights
 ) -> HeightField:
-    """Heights lowered, where nobody saw any, to the bottom of what is missing there.
+    """Lower unseen columns to the bottom of what is missing there.
 
-    What is missing was found to be empty: it does not stand, whatever a steep cell hides below it.
+    What is missing was found to be empty, so it does not stand, even where the scan saw no floor.
     """
     if missing.is_empty():
         return seen
@@ -313,7 +319,7 @@ def without_missing(
 def columns_of(
     solid: manifold3d.Manifold, field: HeightField
 ) -> tuple[Numbers, Float[np.ndarray, " crossings"], Num[np.ndarray, " crossings"]]:
-    """Crossings of a solid with the field's columns: where each column's begin; heights, ways."""
+    """Where vertical lines through the columns cross a solid: offsets by column, heights, signs."""
     x, y = field.origin_mm.tolist()
     ny, nx = field.shape
     offset, *crossed = raster_kernels.column_crossings(*mesh_of(solid), x, y, field.cell_mm, nx, ny)
@@ -323,10 +329,10 @@ def columns_of(
 def _tops(
     points_mm: Points, grid: HeightField, options: HeightOptions
 ) -> tuple[HeightMap, ColumnMask]:
-    """Mean height of each cell's topmost surface.
+    """The mean height of each cell's topmost surface, and whether the cell has points.
 
-    A point alone above the others of its cell, which no neighbouring cell has anything as high as,
-    is none: a scanner's stray would keep the nozzle away from all around it.
+    A single point above the others of its cell is ignored where no neighbouring cell is as high:
+    a scanner's stray point would keep the nozzle away from everything around it.
     """
     points, band_mm = read_only(points_mm), options.top_band_mm
     column = kernels.columns(points, grid.origin_mm, grid.cell_mm, *grid.shape)
@@ -345,16 +351,16 @@ def _tops(
 def _close_gaps(
     z_mm: HeightMap, seen: ColumnMask, cell_mm: float, options: HeightOptions
 ) -> tuple[HeightMap, ColumnMask]:
-    """A few cells that sampling left empty among seen ones take their highest seen neighbour.
+    """Fill small gaps of sampling: each empty cell takes the height of its highest neighbour.
 
-    Each its own: chance links such cells by their corners, and a wall beside one is none beside
-    the last of them.
+    Cell by cell and not gap by gap, since gaps may touch by their corners over some distance, and a
+    wall beside one cell is not beside the next.
     """
     groups, count = ndimage.label(~seen, structure=np.ones((3, 3)))
     size = np.bincount(groups.ravel(), minlength=count + 1)
     small = (size <= max(1, int(options.gap_mm2 / cell_mm**2)))[groups] & ~seen
     z_mm, known = z_mm.copy(), seen.copy()
-    while True:  # from the rim in: a gap of a few cells has no more of them
+    while True:  # from the rim inwards
         highest = ndimage.maximum_filter(np.where(known, z_mm, -np.inf), 3)
         new = small & ~known & np.isfinite(highest)
         if not new.any():

@@ -1,8 +1,8 @@
-"""What stands in mid-job: the scan's heights with the walls of the lines that the job laid there.
+"""What stands in mid-job: the scan's heights, with walls where the job's lines have them.
 
-A cell of the scan is as high as the highest thing in it: beside a void that makes its walls up to a
-cell thicker than they are, and what keeps the head off them as much wider. The job knows where its
-lines lie to the hundredth of a millimetre; what is missing says which of them do not stand.
+A cell of the scan is as high as the highest thing in it. Beside a void this makes walls up to a
+cell thicker than they are, and keeps the head farther off. The job knows to a hundredth of a
+millimetre where its lines lie, and the deficit says which of them are missing.
 """
 
 from __future__ import annotations
@@ -36,16 +36,17 @@ def standing_in_job(
     spacing_mm: float,
     options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> HeightField:
-    """The as-built field in mid-job: as seen, without what is missing, with the lines' own walls.
+    """Make the height field in mid-job: as seen, less what is missing, with the lines' walls.
 
     All is in the build frame.
 
     Parameters
     ----------
     lines
-        All that the job has laid so far; None: nobody knows, and cells stay as seen.
+        All lines that the job has laid so far; None where they are not known: then heights stay as
+        they were seen.
     scan
-        What of its points stands out of the field raises it.
+        Points that stand out of the field raise it.
     """
     seen = without_missing(seen, missing, options)
     if lines is None or missing.is_empty():
@@ -60,10 +61,10 @@ def standing_lines(
     missing: manifold3d.Manifold,
     options: HeightOptions = USUAL_DEFICIT.heights,
 ) -> HeightField:
-    """The as-built field on a fine grid, beside what is missing with the walls of lines laid.
+    """The height field on a fine grid, where walls beside what is missing are those of the lines.
 
-    Elsewhere the scan alone decides, and also there where it saw something higher. Something is
-    missing, and all is in the build frame.
+    Elsewhere the scan alone decides, and also where it saw something higher. Something must be
+    missing; all is in the build frame.
     """
     fine = fine_over(seen, options)
     at = cells_over(seen, fine)
@@ -93,11 +94,12 @@ def _steps_of_plan(
     around: int,
     options: HeightOptions,
 ) -> tuple[HeightMap, ColumnMask]:
-    """Heights as seen, whose steps lie where the plan has them; and which are known.
+    """Heights as seen, but with steps where the plan has them; and which columns are known.
 
-    A cell reads as high as the highest thing in it: what it is too high by beside a wall is the
-    wall's. What is lower than planned is not there. Where both agree what was seen is right: layers
-    are not as high as planned, and a floor off by a tenth of a layer is a tenth of a bead.
+    A cell of the scan reads as high as the highest thing in it, so beside a wall its excess height
+    is the wall's, and the plan decides. What was seen lower than planned is not there. Where scan
+    and plan agree, the scan is right: layers are not quite as high as planned, and a floor that is
+    off by a tenth of a layer is a tenth of a bead.
     """
     off_mm = seen_mm - planned_mm
     agrees = told & (np.abs(off_mm) < options.trust_mm)
@@ -114,9 +116,9 @@ def _steps_of_plan(
 def _planned(
     near: HeightField, lines: JobLines, missing: manifold3d.Manifold
 ) -> tuple[HeightMap, ColumnMask]:
-    """How high the lines stand that are not missing, and where something is.
+    """How high the lines stand that are not missing, and the columns in which something is.
 
-    A layer of a column stands where more of it is there than not.
+    In each column a layer stands if more of it is there than is missing.
     """
     ny, nx = near.shape
     low_mm = float(missing.bounding_box()[2])

@@ -1,4 +1,4 @@
-"""How solids are made of what a test found, and heights of what stands: each number once."""
+"""Options of the deficit: how solids and the heights of what stands are made, each number once."""
 
 from __future__ import annotations
 
@@ -9,27 +9,30 @@ from amrepair.regions.options import SkippedOptions
 
 @dataclass(frozen=True, slots=True)
 class VoxelOptions:
-    """Grids of distances around defects, where they lie, and which solids are made on them.
+    """The grids of distances around defects on which solids are made.
 
     Attributes
     ----------
     most
-        Samples of one grid, about.
+        About how many samples one grid has at most.
     finest_mm, coarsest_mm
-        Between samples.
+        Least and largest distance between samples.
     across_ratio, least_ratio
-        Samples across a defect, and what must be left of them where a box is large.
+        How many samples lie across a defect's depth, and the least number where a box is so large
+        that `most` limits it.
     margin_mm
-        Around what was found: of a grid.
+        Margin of a box around what was found.
     film_mm, even_mm, least_film_mm2, facing
-        Beside what is deep, a film is sampled as finely as if it were alone: no thicker than the
-        first, on a surface this even, this large, and facing out of the template by this cosine.
+        A film beside a deep defect is sampled as finely as if it were alone. It is a film if it is
+        thinner than `film_mm`, even to `even_mm`, larger than `least_film_mm2`, and faces out of
+        the template (`facing`, a cosine).
     path_step_mm
-        Along ways from a void's floor to its mouth.
+        Step along the straight lines from a void's floor to its mouth.
     sliver_ratio
-        Under a layer's top, of the limit: what the surfel nearest to it is labelled for is missing.
+        Under the top of the layer just printed: share of the threshold above which a place counts
+        as missing if the nearest surfel is labelled so.
     crumb_mm3
-        Smaller pieces are what marching cubes makes of noise at a rim.
+        Smaller pieces are dropped: they are what marching cubes makes of noise at a rim.
     """
 
     most: int = 1_000_000
@@ -49,48 +52,51 @@ class VoxelOptions:
 
 @dataclass(frozen=True, slots=True)
 class HeightOptions:
-    """The as-built height field of the scan, and of scan and solids together.
+    """The height field of what stands, from the scan alone and from scan and solids together.
 
     Attributes
     ----------
     cell_mm
-        Width of the columns of what the scan alone says.
+        Width of the columns of the scan's own height field.
     unseen_margin_mm
-        What nobody saw is solid up to the printed height, or the template, and this much more.
+        Unseen columns count as solid up to the printed height, or the template, plus this margin.
     beside_part_mm
-        More than a nozzle's cone, so that what stands beside the part is in the field.
+        Margin of the field around the part: more than the radius of a nozzle's cone, so that what
+        stands beside the part is in it.
     top_band_mm
-        Points within this of a cell's top are one surface with its noise.
+        Points within this band below a column's topmost point are one surface with its noise.
     gap_mm2
-        A smaller unseen patch between seen ones is a gap of sampling, not a place to hide.
+        A smaller unseen patch among seen columns is a gap of sampling, in which nothing can hide.
     fine_cell_mm, most_fine_cells
-        Of the field that has the solids' walls.
+        Width and largest number of columns of the fine field, which has the solids' walls.
     by_wall_cells
-        In cells of the scan: one that a wall's noise touches, and a gap beside it that took its
-        height.
+        How far beside a wall the scan's columns are not trusted, in columns of the scan: one that
+        the wall's noise touches, and a gap beside it that took its height.
     trust_mm
-        The scan may stand out this much before it overrules the solids: their tolerance, and noise.
+        The scan overrules the solids where it stands out of them by more than this: their
+        tolerance, and noise.
     noise_mm
-        Of a cell with many points.
+        Noise of a column with many points.
     chance_mm
-        What a cell with a single point may be off: of some thousand under the head one is so far.
+        How far a column with a single point may be off: of some thousand under the head one is.
     film_mm
-        Two layers: thinner material over a void is the solids' own rounding at its rim.
+        Thinner material over a void is the solids' rounding at its rim, and ignored: two layers.
     least_film_mm
-        That the scan can tell from nothing.
+        The thinnest film that the scan can tell from nothing.
     fin_cells, unseen_fin_cells, chance_cells
-        In fine cells: thinner than a bead; than two, of which points would have been seen; and so
-        few without a point among others are chance.
+        In fine columns: a fin is thinner than a bead; an unseen fin is thinner than two, of which
+        points would have been seen; and so few columns without a point are chance.
     most_steps_down
-        By which what nobody saw is followed down.
+        In how many steps, at most, unseen columns are lowered along rays.
     off_sigma
-        In the scan's noise: how far a point is off upwards or aside, and tells of nothing. Of the
-        thousands on walls beside what is missing one in fifty lies two off, and each would keep
-        the head away.
+        A point stands out if it lies this many standard deviations of the scan's noise above all
+        surface that is as near to it, seen from above. With 2 one in fifty of the thousands of
+        points on walls beside a defect would, and each keeps the head away.
     crest_sigma
-        In the scan's noise: the highest of the points on what stands out lies so far over it.
+        The highest point on something that stands out lies so many standard deviations above it.
     others_near, beside_spacings
-        On any surface so many others lie within so many spacings: 4 π are expected on a flat one.
+        A point counts only if so many others lie within so many point spacings; on a flat surface
+        4 π are expected.
     """
 
     cell_mm: float = 0.25
@@ -118,37 +124,44 @@ class HeightOptions:
 
 @dataclass(frozen=True, slots=True)
 class WallOptions:
-    """Walls, crests and rims beside what is missing, in cells of the fine field.
+    """Walls, crests and rims beside what is missing; cells are columns of the fine field.
 
     Attributes
     ----------
     step_mm
-        From column to column: a wall, not a slope.
+        A larger step from column to column is a wall, not a slope.
     beside_cells
-        Around what is missing: there the solids' walls are the scan's.
+        How far around what is missing walls are sharpened.
     radius_mm
-        Around a column; a round wall of 4 mm across leaves its plane by no more than noise within.
+        Points within this distance of a column tell its wall's plane; a round wall 4 mm across
+        leaves its plane there by no more than noise.
     below_top_sigma, over_foot_sigma
-        Points so near to a wall's ends, in the scan's noise, belong to what lies above or below it.
+        Points nearer than this to a wall's top or foot, in the scan's noise, belong to what lies
+        above or below it, and are left out.
     most_spread_sigma
-        What lies farther from its plane than noise alone, on average, is more than one wall.
+        Points that scatter more than this about their plane, in the scan's noise, are of more than
+        one wall.
     inside_sigma
-        A point so far inside the template, in the scan's noise, lies on what broke.
+        A point deeper than this inside the template, in the scan's noise, lies on broken surface.
     most_slant
-        Cosine: a wall is steeper than 75°.
+        A wall's normal rises by at most this cosine: it is steeper than 75°.
     crest_cells, crest_reach_cells
-        Thinner than a bead; and along it, as far as between two points that were seen.
+        A crest is thinner than this, a bead; and it is followed so far along, from one seen point
+        to the next.
     splinter_mm
-        A crest that stands so little lower than designed has lost its points, no more.
+        A crest lower than designed by no more than this has only lost its points.
     steep_mm
-        A face of what is missing is steep where it falls by this from a cell to the next (83°).
+        A face of what is missing is steep where it falls by this from one column to the next (83°).
     rounded_mm, rounded_cells, as_designed_mm, foot_cells
-        So much of a lip the solids' rounding may have taken, so many cells wide; what is as
-        designed; how far from it the foot of a face is looked for.
+        The solids' rounding may have lowered a lip by up to `rounded_mm`, over `rounded_cells`. A
+        column counts as designed within `as_designed_mm`, and the foot of a face is looked for
+        within `foot_cells` of it.
     edge_mm, rounded_spacings
-        A fall from cell to cell that is a top's edge; how far from it tops are rounded off.
+        A larger fall from column to column is the edge of a top; up to `rounded_spacings` point
+        spacings from it tops are rounded off.
     sound_mm, least_sound, uneven_mm
-        Beyond that, as far a top is looked at, at so many columns at least; and how even it is.
+        Beyond that a top is looked at over `sound_mm`, at `least_sound` columns or more; it is
+        even if it varies by no more than `uneven_mm`.
     """
 
     step_mm: float = 0.3
@@ -176,16 +189,17 @@ class WallOptions:
 
 @dataclass(frozen=True, slots=True)
 class DeficitOptions:
-    """Settings of a deficit; it records those it was made with.
+    """Settings of a deficit; a result records those it was made with.
 
     Attributes
     ----------
     bead_mm3
-        One bead of 0.45 × 0.2 mm as long as two nozzle widths: less cannot be placed.
+        The smallest bead that can be placed: 0.45 × 0.2 mm, as long as two nozzle widths.
     early_mm3
-        From so much on heights will be asked for: what a clean layer's crumbs never are.
+        From this missing volume on heights are made at once, beside the solids, since they will be
+        asked for; the crumbs of a clean layer are never so large together.
     skipped, voxels, heights, walls
-        Of each stage.
+        Options of the stages.
     """
 
     bead_mm3: float = 0.08
@@ -197,4 +211,4 @@ class DeficitOptions:
 
 
 USUAL_DEFICIT = DeficitOptions()
-"""What the loop and the command line go by."""
+"""The default of the loop and the command line."""

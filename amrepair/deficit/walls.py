@@ -1,9 +1,9 @@
-"""Walls beside what is missing, as sharp as the scan has them.
+"""Walls beside what is missing, as sharp as the scan's points show them.
 
-The solids' walls there come from cells of the scan, whose planes round off corners and waver by
-some hundredths of a millimetre: whether a column of the field is wall or not is left to chance by
-that, and one too many in a row keeps the nozzle's cone away all along. A plane through the points
-of the wall itself, column by column, knows better.
+The solids' walls come from cells of the scan, whose planes round off corners and waver by some
+hundredths of a millimetre. So it is left to chance whether a column beside a wall is high or low,
+and a single column too many keeps the nozzle's cone away from the whole wall. Planes fitted to the
+points of the wall itself, column by column, are more exact.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ def with_sharp_walls(
     *,
     deviation_mm: Values | None = None,
 ) -> HeightField:
-    """The as-built field, columns beside walls high or low as their middles lie to the wall.
+    """Make columns beside walls high or low, by the side of the wall on which their middles lie.
 
     Parameters
     ----------
     gone
-        Columns that something is missing from: only walls beside them are looked at.
+        Columns in which something is missing; only walls beside them are sharpened.
     points_mm
-        What was seen, build frame.
+        The scan's points, build frame.
     deviation_mm
-        How far each lies out of the template, negative inside: what broke lies in it. Between a
-        void and the part's own outside a wall may be thinner than `radius_mm`, and a plane through
-        the points of both its faces is none. None: nobody knows.
+        The signed distance of each point to the template; broken surface lies inside. A wall
+        between a void and the part's outside may be thinner than `radius_mm`, and by this its two
+        faces are kept apart. None where it is not known.
     """
     if not gone.any() or sigma_mm <= 0:
         return field
@@ -80,12 +80,12 @@ def with_rims(
     spacing_mm: float,
     options: WallOptions = USUAL_DEFICIT.walls,
 ) -> HeightField:
-    """The as-built field, crests, tops and lips beside what is missing as high as they stand.
+    """Raise crests, tops and lips beside what is missing to the height at which they stand.
 
     Parameters
     ----------
     lost_mm, designed_mm
-        How much is missing from each column, from end to end, and the top of what was expected.
+        How much is missing in each column, from end to end, and the expected top of each column.
     """
     gone = lost_mm > 0
     if not gone.any():
@@ -106,11 +106,11 @@ def with_rims(
 def even_crests(
     z_mm: HeightMap, lost_mm: HeightMap, designed_mm: HeightMap, options: WallOptions
 ) -> HeightMap:
-    """What is thinner than a bead beside what is missing as high as near by.
+    """Raise crests, thinner than a bead, to their highest columns near by.
 
-    A crest, a splinter or the thin end of a lip is sampled by few points, and solids round it off:
-    what lies between two of its columns that were seen is no lower than the higher of them, and
-    where that is a little lower than designed, beside a steep face, it is as designed.
+    A crest, a splinter or the thin end of a lip has few points on it, and solids round it off. So
+    columns between two seen ones are taken to be as high as the higher of those; and where that is
+    only a little lower than designed, beside a steep face, as high as designed.
     """
     beside = ndimage.maximum_filter(lost_mm > 0, 2 * options.beside_cells + 1)
     # where what is missing lies on what stands, not beside a wall that reads too far in
@@ -135,12 +135,11 @@ def rising_rims(
     reach: int,
     options: WallOptions,
 ) -> HeightMap:
-    """Tops that rise towards an edge extended up to it, or to the template.
+    """Extend tops that rise towards an edge up to that edge, but not beyond the template.
 
-    Solids round off a sharp rim: its last columns read as high as what lies some points farther in,
-    up to 0.3 mm too low for a worn edge that rises at 45°. A plane through what lies beyond their
-    rounding knows better: `rounded` columns are rounded off, and it goes through those within
-    `reach`.
+    Solids round off a sharp rim: its last columns read as high as those some points farther in, up
+    to 0.3 mm too low for a worn edge that rises at 45°. So the outermost `rounded` columns are set
+    by a plane through the columns farther in, within `reach`.
     """
     deep = lost_mm > options.steep_mm
     beside = ndimage.maximum_filter(deep, 2 * options.beside_cells + 1)
@@ -158,11 +157,11 @@ def rising_rims(
 def whole_rims(
     z_mm: HeightMap, lost_mm: HeightMap, designed_mm: HeightMap, options: WallOptions
 ) -> HeightMap:
-    """Tops beside a steep face of what is missing as designed up to the face.
+    """Raise tops beside a steep face of what is missing to the designed height, up to the face.
 
-    Solids round off such a lip by some tenths of a millimetre. Where a top is as designed up to a
-    few columns from a face, and falls steeply there, it ends at the face and not before; what lies
-    lower along a slope, as of a worn edge, is lower.
+    Solids round off such a lip by some tenths of a millimetre. A top that is as designed up to a
+    few columns from a steep face ends at the face and not before it. Beside a slope, as of a worn
+    edge, lower columns are left as they are.
     """
     deep = lost_mm > options.steep_mm  # beside a line that was skipped nothing stands as if cut
     off_mm = designed_mm - z_mm
@@ -175,7 +174,7 @@ def whole_rims(
 
 
 def window_around(gone: ColumnMask, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the window around those that something is missing from."""
+    """The window, with a margin, around the columns in which something is missing."""
     rows, columns = (
         slice(max(int(k.min()) - margin, 0), int(k.max()) + margin + 1) for k in gone.nonzero()
     )
@@ -185,7 +184,7 @@ def window_around(gone: ColumnMask, margin: int) -> tuple[slice, slice]:
 def _by_cell(
     points_mm: Points, corner_mm: Float[np.ndarray, " 2"], cell_mm: float, shape: tuple[int, int]
 ) -> kernels.PointsByCell:
-    """Points over a grid sorted by its cells, and where those of each cell begin, by row."""
+    """Sort points by the cells of a grid; with where each cell's points begin, row by row."""
     ny, nx = shape
     high_mm = corner_mm + cell_mm * np.array([nx, ny])
     own = points_mm[in_box(points_mm[:, :2], corner_mm, high_mm)]

@@ -1,7 +1,7 @@
-"""Evidence: what the scan says about any point in space, empty or solid, and by how much.
+"""Evidence: whether a scan shows a point in space to be empty or solid, and by how much.
 
-Rays decide where sensors are known; elsewhere the nearest scanned surface does. Where neither
-speaks the answer is "solid": unseen is never called missing. It labels nothing.
+Rays decide where sensors are known; elsewhere the nearest scanned surface does. Where neither tells
+anything the answer is "solid", so that unseen is never called missing.
 """
 
 from __future__ import annotations
@@ -21,28 +21,30 @@ from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
-# "Solid, as far as anybody knows": a clearance well below every threshold.
+# The clearance of an unseen point: solid, well below every threshold.
 SOLID_MM = -5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Surfels, their outward planes where they left the template, and range images.
+    """What a scan tells of space: surfels, their planes where they left the template, and rays.
 
     Attributes
     ----------
     surfels
         The condensed scan, template frame.
     off
-        (s,) surfels that lie off the template (labelled missing or excess).
+        (s,) whether a surfel lies off the template, on broken or additional surface.
     normal
-        (s, 3) outward unit normals where `off`; zero elsewhere (the template's field serves).
+        (s, 3) outward unit normals of surfels that are `off`; zero elsewhere, where the template's
+        own normals serve.
     images
-        Range images, one per sensor; empty where sensors are unknown.
+        Range images, one for each sensor; empty where sensors are not known.
     options
-        That it was gathered with.
+        The options it was gathered with.
     faces
-        What the scan says around defects where no rays tell; None where there are, or no defect.
+        The scanned faces around defects, which decide where there are no rays; None where there
+        are rays, or no defect.
     """
 
     surfels: Surfels
@@ -65,10 +67,10 @@ class Evidence:
     def clearance(
         self, points_mm: Points, f_mm: Values, most_mm: float = np.inf
     ) -> tuple[Values, Values]:
-        """How far each point lies outside the as-built part: best estimate, and a cautious one.
+        """How far each point lies outside the as-built part: a best and a cautious estimate.
 
-        Positive is empty. `f_mm` is the template's distance at the points; how much farther than
-        `most_mm` it is need not be told.
+        Positive means empty. `f_mm` is the template's distance at the points. Clearances beyond
+        `most_mm` need not be exact.
         """
         if not self.has_rays:
             near = self._by_surface(points_mm, f_mm, most_mm)
@@ -77,7 +79,7 @@ class Evidence:
         return self._sharpened(points_mm, f_mm, best), least
 
     def cautious(self, points_mm: Points, f_mm: Values, most_mm: float = np.inf) -> Values:
-        """The cautious half of `clearance`, which costs the less."""
+        """The cautious estimate of `clearance` alone, which is cheaper."""
         if not self.has_rays:
             return self._by_surface(points_mm, f_mm, most_mm)
         return clearances(self.images, points_mm, SOLID_MM)[1]
@@ -87,17 +89,17 @@ class Evidence:
         return clearances(self.images, points_mm, SOLID_MM)[0]
 
     def _by_surface(self, points_mm: Points, f_mm: Values, most_mm: float) -> Values:
-        """What the scanned surface says where there are no rays."""
+        """The clearance by the scanned surface, where there are no rays."""
         if self.faces is not None:
             return self.faces.clearance(points_mm, f_mm, most_mm)
         return self.surface_clearance(points_mm, f_mm)
 
     def _sharpened(self, points_mm: Points, f_mm: Values, best_mm: Values) -> Values:
-        """What the rays say, as far as a pixel allows corrected by the scanned surface.
+        """The clearance by rays, corrected by the scanned surface within a pixel's uncertainty.
 
-        The emptiest of several noisy images lies too deep, and beside a silhouette every pixel is
-        a step of its own: means and planes over cells know better where the surface is, the rays
-        on which side of it a point lies.
+        Rays know on which side of the surface a point lies, while averages over cells know better
+        where the surface is: the emptiest of several noisy images lies too deep, and beside a
+        silhouette every pixel is a step.
         """
         step_mm = max(image.step_mm for image in self.images)
         limit_mm = self.options.sharp_steps * step_mm
@@ -154,10 +156,11 @@ def gather(
 
 
 def with_stubs(evidence: Evidence, gone_mm: Points, labelled: Bool[np.ndarray, " s"]) -> Evidence:
-    """The same evidence, knowing the tops of what is left of walls one bead wide.
+    """The same evidence, with the tops of broken walls one bead wide counted as broken surface.
 
-    Such a top lies inside the template, yet nearer to its side than any limit: where template
-    beside it is gone it is a surface of its own, and faces the sensors.
+    Such a top lies inside the template, but nearer to the wall's side than any threshold. Where
+    template surface beside it is gone (`gone_mm`), it is a surface of its own and faces the
+    sensors.
     """
     s, options = evidence.surfels, evidence.options
     near = has_near(s.place_mm, gone_mm, options.stub_cells * s.cell_mm)
@@ -172,7 +175,7 @@ def with_stubs(evidence: Evidence, gone_mm: Points, labelled: Bool[np.ndarray, "
 
 
 def _toward(planes: Points, guide: Points) -> Points:
-    """Planes turned to the side of their guides."""
+    """Normals of planes, turned to the side of their guides."""
     sign = np.where((planes * guide).sum(axis=1) < 0, -1.0, 1.0)
     return np.asarray(planes * sign[:, None])
 
@@ -180,10 +183,10 @@ def _toward(planes: Points, guide: Points) -> Points:
 def _seen_from_within(
     template: Template, surfels: Surfels, off: Mask, options: EvidenceOptions
 ) -> Mask:
-    """Surfels along the template's surface that were seen through the template.
+    """(s,) surfels along the template's surface that a sensor saw from inside the template.
 
-    A sheet that is left on the bed lies within noise of the template's underside, yet its upper
-    side was seen from above: it faces the other way, and what lies over it is empty.
+    A thin sheet that is left on the bed lies within noise of the template's underside. But a sensor
+    above saw it, so it is the sheet's upper side, and what lies over it is empty.
     """
     found, which = np.zeros_like(off), np.flatnonzero(~off)
     facing = surfels.toward_sensors(which)
@@ -196,10 +199,10 @@ def _seen_from_within(
 
 
 def _strips(template: Template, surfels: Surfels, off: Mask, options: EvidenceOptions) -> Mask:
-    """Surfels beside off-template ones whose plane crosses the template's surface.
+    """(s,) surfels beside off-template ones whose plane crosses the template's surface.
 
-    The broken end of a thin wall lies at f ≈ 0 along both rims, yet it is no part of the
-    template's surface: its plane says so.
+    The broken end of a thin wall lies at f ≈ 0 along both rims. Its plane tells that it is no part
+    of the template's surface.
     """
     near = off.copy()
     for _ in range(2):
@@ -212,7 +215,7 @@ def _strips(template: Template, surfels: Surfels, off: Mask, options: EvidenceOp
 
 
 def _outward(template: Template, surfels: Surfels, which: Numbers) -> Points:
-    """(q, 3) which way the template's surface faces at some surfels."""
+    """(q, 3) outward normals of the template's surface at some surfels."""
     return unit_vectors(template.distance_and_gradient(surfels.place_mm[which])[1])
 
 

@@ -1,7 +1,7 @@
-"""Surfels: the scan condensed to occupied cells, so that noise averages out before any decision.
+"""Surfels: a scan condensed to occupied cells, so that noise averages out before any decision.
 
-A surfel is the mean of the points in one cell: place, deviation, count. It knows its neighbours,
-and so a bead-sized average and a local plane. It decides nothing.
+A surfel is the mean of the points in one cell: its place, its deviation, and how many there are. A
+table of neighbouring cells gives local planes and averages over the width of a bead.
 """
 
 from __future__ import annotations
@@ -33,25 +33,27 @@ class Surfels:
     Attributes
     ----------
     cell_mm
-        Edge of a cell, about twice the point spacing.
+        The edge of a cell, about twice the point spacing.
     spacing_mm
-        Mean distance between neighbouring points, estimated.
+        The mean distance between neighbouring points, estimated.
     place_mm
-        (s, 3) mean of the points in each cell.
+        (s, 3) the mean place of the points in each cell.
     deviation_mm
-        (s,) mean f of the points in each cell.
+        (s,) their mean signed distance to the template.
     count
-        (s,) points in each cell.
+        (s,) their number.
     spread_mm
-        Robust standard deviation of f within a cell: the noise as the scan shows it.
+        Robust standard deviation of deviations within a cell: the noise as the scan shows it.
     table
-        (s, 27) neighbours, −1 where empty.
+        (s, 27) the cell itself and its neighbours, by number; −1 where there is none.
     of_point
-        (n,) the surfel of each point, −1 for points left out.
+        (n,) the cell of each point of the scan; −1 for points that were left out.
+    moments
+        (s, 12) sums over each cell's points, from which planes are fitted.
     point_deviation_mm
-        (n,) deviation of each point.
+        (n,) the deviation of each point of the scan.
     sensor_mm
-        (s, 3) mean place of what saw each point of a cell; None where nobody knows.
+        (s, 3) the mean place of the sensors that saw a cell's points; None where not known.
     """
 
     cell_mm: float
@@ -71,7 +73,7 @@ class Surfels:
 
     @cached_property
     def tree(self) -> PlaceTree:
-        """Of the places; made when first asked for, as at a clean layer few are."""
+        """A search tree of the places, made when first asked for: a clean layer needs none."""
         return PlaceTree.of(self.place_mm)
 
     def planes(self, which: Numbers) -> Points:
@@ -85,10 +87,11 @@ class Surfels:
         return np.asarray(np.linalg.eigh(covariance)[1][:, :, 0])
 
     def halves_joined(self, which: Numbers, normal: Points) -> Surfels:
-        """The same where a cell's end that lies in the surface does not part it in two.
+        """The same surfels, with some moved onto the surface that a cell's boundary cuts in two.
 
-        Each of the cells in `which` is moved along its normal onto the mean of what the cells
-        before and behind it hold of the same surface, as if it had been laid around that.
+        Where a boundary between cells runs along the surface, the cells on both sides hold halves
+        of its points. Each cell in `which` is moved along its normal to the mean of its own points
+        and of those that the cells before and behind it hold of the same surface.
         """
         place = self.place_mm.copy()
         axis = np.abs(normal).argmax(axis=1)
@@ -105,16 +108,16 @@ class Surfels:
     def wide_mean(
         self, value: Values, which: Int[np.ndarray, " q"] | slice = slice(None)
     ) -> Float[np.ndarray, " q"]:
-        """(q,) the mean of a value of the cells over each and its 26 neighbours: a bead's window.
+        """(q,) a value averaged over each cell and its 26 neighbours, about as wide as a bead.
 
-        Of the cells in `which`, all by default.
+        For the cells in `which`; by default for all.
         """
         sums = np.stack([self.count * value, self.count], axis=1)
         wide = kernels.neighbour_sums(self.table[which], sums)
         return np.asarray(wide[:, 0] / wide[:, 1])
 
     def by_view(self, view_index: Int[np.ndarray, " m"]) -> Shares:
-        """What each view says of each cell that it saw, the cells rising."""
+        """What each view contributes to each cell that it saw, ordered by cells."""
         views = int(view_index.max(initial=0)) + 1
         count, total_mm = kernels.sums_by_view(
             self.of_point, view_index, self.point_deviation_mm, len(self), views
@@ -124,7 +127,7 @@ class Surfels:
         return Shares(place, view, total_mm[place, view] / seen, seen)
 
     def toward_sensors(self, which: Numbers) -> Points | None:
-        """(n, 3) mean way from some cells' points to what saw them; None where nobody knows."""
+        """(n, 3) vectors from some cells to the sensors that saw them; None where not known."""
         if self.sensor_mm is None:
             return None
         return np.asarray(self.sensor_mm[which] - self.place_mm[which])
@@ -133,7 +136,7 @@ class Surfels:
 def make_surfels(
     scan: Scan, deviation_mm: Values, keep: Mask, options: SurfelOptions = USUAL_SURFELS
 ) -> Surfels:
-    """Condense the points in `keep`; the cell follows their spacing."""
+    """Condense the points in `keep` to cells, whose size follows from the point spacing."""
     points_mm, sensor_mm = scan.points_mm, None
     box = box_of(np.compress(keep, points_mm, axis=0)) if keep.any() else np.zeros((2, 3))
     spacing_mm = _spacing(points_mm, keep, box, options)
@@ -166,7 +169,7 @@ def make_surfels(
 
 
 def estimate_spacing(points_mm: Points) -> float:
-    """Mean spacing of a surface cloud from how many 1 mm (or larger) cells it occupies."""
+    """Estimate a surface cloud's mean point spacing from how many coarse cells it occupies."""
     return _spacing(points_mm, np.ones(len(points_mm), bool), box_of(points_mm), USUAL_SURFELS)
 
 
@@ -189,9 +192,9 @@ def _spacing(
 def _numbered(
     points_mm: Points, keep: Mask, box_mm: Float[np.ndarray, "2 3"], cell_mm: float
 ) -> tuple[Numbers, Int[np.ndarray, " s"], tuple[int, int]]:
-    """Which occupied cell each point lies in, −1 if left out; those cells' keys, and strides.
+    """Number the occupied cells: each point's number (−1 if left out), the cells' keys, strides.
 
-    Keys rise with x, y and z in a grid with an empty layer around.
+    Keys rise with x, y and z, on a grid with an empty layer around it.
     """
     shape = np.floor((box_mm[1] - box_mm[0]) / cell_mm).astype(np.int64) + 3
     strides = (int(shape[1] * shape[2]), int(shape[2]))

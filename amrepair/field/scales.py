@@ -1,8 +1,8 @@
-"""Scales: the deviations of a field's cells as robust local means over wider and wider windows.
+"""Scales: robust local means of the deviations, over wider and wider windows.
 
-Every scale has cells twice as wide as the one before; the value of a cell is the median of the
-cells in it, and a window is a cell with the neighbours that face the same way, so that the two
-sides of a thin wall stay apart. It measures; what is significant is decided in `regions`.
+From scale to scale cells double in width. The value of a wider cell is the median of the cells in
+it, and a window is a cell with those neighbours that face the same way, so that the two sides of a
+thin wall are not mixed. This module measures; `regions` decides what is significant.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from amrepair.frames import cells_of, unit_vectors
 # Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
 # of a wall and the faces of an edge are not.
 WINDOW_FACING = 0.5
-# The third lowest and highest of a window: three cells together are a surface, two may be chance.
+# The third lowest and third highest cell of a window count: three cells are a surface, two chance.
 RANK = 3
-# Observations in a cell of what strays: it has a place, and no part in what is seen around it.
+# The weight of a cell of stray points: it keeps its place, but hardly counts in windows around it.
 NOTHING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """The field at one scale, template frame.
+    """All windows of one width, one around each cell, template frame.
 
     Attributes
     ----------
     cell_mm
-        Edge of a cell.
+        The edge of a cell at this scale.
     of_base
-        (b,) the cell of this scale that each cell of the field lies in.
+        (b,) for each of the original cells the cell of this scale that it lies in.
     place_mm, normal
         (s, 3) weighted mean place and outward unit normal of each cell.
     value_mm
-        (s,) median deviation of the field's cells within.
-    weight
-        (s,) observations within each cell; `window_weight`: within each window.
+        (s,) the median deviation of the narrower cells in it.
+    weight, window_weight
+        (s,) the number of observations in each cell, and in each window.
     table, count
-        (s, k) cells of each window, itself included, and (s,) how many.
+        (s, k) the cells of each window, itself included, and (s,) how many there are.
     median_mm, low_mm, high_mm
-        (s,) median, `RANK`-th lowest and `RANK`-th highest value of each window.
+        (s,) the median, the `RANK`-th lowest and the `RANK`-th highest value of each window.
     noise_mm
-        (s,) standard deviation of the cells' values about their neighbours', as seen around.
+        (s,) standard deviation of a cell's value about those of its neighbours.
     apart
-        (s,) windows that hold none of the other cells.
+        (s,) windows of cells that are kept apart from all others (broken ends of walls).
     """
 
     cell_mm: float
@@ -71,20 +71,20 @@ class Scale:
 
     @property
     def width_mm(self) -> float:
-        """Across a window: a cell with those around it."""
+        """The width of a window: a cell and its neighbours."""
         return 3.0 * self.cell_mm
 
     def cells_of(self, chosen: Mask) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-        """(p,) windows that are chosen, and (p,) the cells in each: a pair for each cell."""
+        """All pairs of a chosen window and a cell in it: (p,) windows and (p,) cells."""
         which = np.flatnonzero(chosen)
         inside = np.arange(self.table.shape[1]) < self.count[which, None]
         return which[np.nonzero(inside)[0]], self.table[which][inside]
 
     @property
     def is_surface(self) -> Mask:
-        """(s,) windows of as many cells as a surface has, most of them of more than one point.
+        """(s,) whether a window holds surface: `RANK` cells or more, of two points on average.
 
-        Points that stray in the air fall into one window by and by, each in a cell of its own.
+        Stray points in the air also share a window now and then, but each in a cell of its own.
         """
         return np.asarray((self.count >= RANK) & (self.window_weight >= 2.0 * self.count))
 
@@ -99,19 +99,20 @@ def scales_of(
     widest_mm: float,
     apart: Mask | None = None,
 ) -> tuple[Scale, ...]:
-    """The field at cells of `cell_mm` and wider, up to windows of `widest_mm` across.
+    """Make the scales, from cells of `cell_mm` up to windows of `widest_mm`.
 
-    What is no surface at the first scale is none at any other, faces nowhere and weighs nothing.
+    Cells that hold no surface at the first scale are given no direction and hardly any weight at
+    the wider ones.
 
     Parameters
     ----------
     place_mm, normal, value_mm, weight
-        Of the field's cells: places, outward unit normals of the template, deviations and numbers
+        Of the original cells: places, outward unit normals of the template, deviations, and numbers
         of observations.
     widest_mm
-        No window is wider than this, but for the first scale's.
+        The largest width of a window; only the first scale's may be wider.
     apart
-        Cells that share no window with the others; None: there are none.
+        Cells that share no window with the others; None where there are none.
     """
     found: list[Scale] = []
     of_base = np.arange(len(place_mm))
@@ -144,7 +145,7 @@ def _scale(
     *,
     medians: bool,
 ) -> Scale:
-    """Group the cells of the scale below, and look at each group's window."""
+    """Group the cells of the narrower scale to wider ones, and form their windows."""
     order, start, keys, strides = _grouped(place_mm, normal, apart, cell_mm)
     group = np.empty(len(order), np.int64)
     group[order] = np.repeat(np.arange(len(start) - 1), np.diff(start))
@@ -183,7 +184,7 @@ def _scale(
 
 
 def ways_of(normal: Points) -> Numbers:
-    """(c,) which of the six ways along the axes normals face most: −x, x, −y, y, −z, z; 6: none."""
+    """(c,) the axis direction that a normal is nearest to: −x, x, −y, y, −z, z; 6 for none."""
     axis = np.abs(normal).argmax(axis=1)
     most = normal[np.arange(len(normal)), axis]
     return np.where(most == 0.0, 6, 2 * axis + (most > 0))
@@ -192,7 +193,7 @@ def ways_of(normal: Points) -> Numbers:
 def _grouped(
     place_mm: Points, normal: Points, apart: Mask, cell_mm: float
 ) -> tuple[Numbers, Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
-    """Order of the cells by the wider cell that holds them, where each begins, keys, strides."""
+    """Sort cells by the wider cell that holds them: order, where each begins, keys, strides."""
     index = cells_of(place_mm, place_mm.min(axis=0), cell_mm) + 1
     shape = index.max(axis=0) + 2
     strides = (int(shape[1] * shape[2]), int(shape[2]))

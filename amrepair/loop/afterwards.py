@@ -11,10 +11,10 @@ import numpy as np
 
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
-from amrepair.loop.buried import buried, buried_mm3, ways
+from amrepair.loop.buried_defects import buried, buried_mm3, ways
 from amrepair.loop.locate import locate_parts
 from amrepair.loop.looks import plan_stops
-from amrepair.policy.ways import Way
+from amrepair.policy.remedies import Way
 from amrepair.repair import RepairPlan
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup

@@ -20,8 +20,8 @@ from amrepair.frames import nearest_box
 from amrepair.loop.layer_level import LayerLevel
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy.acceptance import Piece, defect_volumes
 from amrepair.policy.table import Action, Cover, Finding, judge
-from amrepair.policy.worth import Piece, defect_volumes
 from amrepair.regions import Label, Region
 from amrepair.repair import RepairPlan
 from gcode.check import find_refusals

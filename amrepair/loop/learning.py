@@ -14,9 +14,9 @@ import numpy as np
 
 from amrepair.loop.looks import Stop
 from amrepair.policy.table import Action, Decision
-from amrepair.regions.calibrating import Sound, by_width, calibrated
-from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.regions.detection import judged_scales
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration_fit import Sound, by_width, calibrated
 from amrepair.repair import RepairPlan, Site
 
 FIRST_LOOKS = 3  # clean layers that are learned from

@@ -13,9 +13,9 @@ import numpy as np
 from amrepair.errors import InputError
 from amrepair.loop.locate import first_layer
 from amrepair.policy import Decision
-from amrepair.policy.passes import may_be_left
-from amrepair.policy.worth import volume_mm3
-from amrepair.regions.calibration import Calibration
+from amrepair.policy.acceptance import volume_mm3
+from amrepair.policy.stopping_criteria import may_be_left
+from amrepair.regions.error_calibration import Calibration
 from amrepair.repair import RepairPlan
 from amrepair.scans import Scan
 from gcode.hosts.port import PrintReport

@@ -62,7 +62,7 @@ def settled(look: Look, site: Site, *, compared: bool = False) -> Look:
                 template_label=anomaly.template_label[::apart].copy(),
                 evidence=None,
                 surfel_label=None,
-                sites=None,
+                inspected=None,
             ),
         ),
     )

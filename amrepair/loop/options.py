@@ -11,7 +11,7 @@ from amrepair.loop.pace import Pace
 from amrepair.loop.tape import Tape
 from amrepair.loop.wire import PickUp
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.scans import Scan
 from gcode.profiles import ProcessProfile

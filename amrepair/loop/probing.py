@@ -18,8 +18,8 @@ from jaxtyping import Float
 from amrepair.arrays import Points, Values
 from amrepair.frames import Transform
 from amrepair.loop import travel
-from amrepair.loop.in_turn import finished_at
 from amrepair.loop.looks import Stop, plan_stops
+from amrepair.loop.sequential_objects import finished_at
 from amrepair.loop.tape import FELT
 from amrepair.loop.touch_design import (
     USUAL_TOUCHES,

@@ -15,7 +15,7 @@ from amrepair.frames import Transform
 from amrepair.loop.looks import Look, Stop, plan_stops
 from amrepair.loop.options import Records
 from amrepair.loop.run import run_loop
-from amrepair.loop.setting import Recorded, open_run
+from amrepair.loop.run_folder import Recorded, open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import Tape, read_events
 from amrepair.policy.replay import changed, decided_again

@@ -12,7 +12,6 @@ from scipy import ndimage
 
 from amrepair.arrays import Mask, Points
 from amrepair.frames import Transform
-from amrepair.loop.in_turn import finished_at, refuse_own_hits, template_of
 from amrepair.loop.locate import (
     BESIDE_THE_PART,
     MOVED_MM,
@@ -25,10 +24,11 @@ from amrepair.loop.locate import (
     walls_moved_mm,
 )
 from amrepair.loop.looks import Stop
+from amrepair.loop.sequential_objects import finished_at, refuse_own_hits, template_of
 from amrepair.regions import detect
-from amrepair.regions.calibration import NORMAL_NOISE
+from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair import Detector, Site
 from amrepair.repair.options import USUAL_REPAIR
 from amrepair.repair.site import Finished, Raft

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from amrepair.loop.buried import buried, buried_mm3, pieces_of, ways
+from amrepair.loop.buried_defects import buried, buried_mm3, pieces_of, ways
 from amrepair.loop.filaments import other_material
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
 from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions, decide, gravest, judge
+from amrepair.policy.acceptance import volume_mm3
 from amrepair.policy.limits import exceeded
-from amrepair.policy.passes import is_little, is_stuck
+from amrepair.policy.stopping_criteria import is_little, is_stuck
 from amrepair.policy.table import Action, Situation
-from amrepair.policy.worth import volume_mm3
 from amrepair.repair import RepairPlan, Site
 from gcode.profiles import ProcessProfile
 from gcode.reader import Job

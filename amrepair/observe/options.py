@@ -1,4 +1,4 @@
-"""What of a scan is not the part: each number once."""
+"""Options of the background, that is of the points of a scan that are not the part."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ class BackgroundOptions:
     Attributes
     ----------
     most_excess_mm
-        Excess farther out than this is not part of the print (clutter, the bed's rim).
+        Points farther outside the template than this are clutter, or the bed's rim.
     band_mm
-        Bed, skirt and first-layer ooze: one thick layer above the lowest plane of the part.
+        Points up to this far above the part's lowest plane are the bed, a skirt or first-layer
+        ooze: one thick layer.
     noise_sigmas
-        Of a plane's points one in 30,000 lies farther from it.
+        The band is at least this many standard deviations of the scan's noise: of a plane's points
+        one in 30,000 lies farther off.
     below_mm
-        Under the bed's band, what lies so far from the part is none of it.
+        Below that band, points farther than this from the part do not belong to it.
     bed_cell_mm, bed_points
-        What lies on the bed is told from it by places so wide, of so many points or more.
+        The bed is told from what lies on it in cells of this width with this many points or more.
     bed_apart_mm
-        So near to what stands on it the bed is not asked for a scan's errors.
+        Where something stands nearer than this, the bed does not tell the scan's errors.
     seen_underside, underside_rim_mm, foot_cell_mm, most_foot
-        So much of the underside seen, so far from its rim: nothing lies under the part, there is no
-        bed. It is counted in such cells, on so many points.
+        Where this share of the underside was seen, by points farther than `underside_rim_mm` from
+        its rim, nothing lies under the part, so there is no bed. The share is counted in cells of
+        `foot_cell_mm`, on about `most_foot` points.
     """
 
     most_excess_mm: float = 12.0
@@ -42,4 +45,4 @@ class BackgroundOptions:
 
 
 USUAL_BACKGROUND = BackgroundOptions()
-"""What the test for regions goes by."""
+"""The default of the test for regions."""

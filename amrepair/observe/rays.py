@@ -1,7 +1,7 @@
-"""Rays: what each sensor saw through, from its own points alone.
+"""Rays: which space each sensor saw to be empty, from its own points alone.
 
-A scan point says that the straight line from the sensor to it was empty. A range image per
-sensor makes that a question of one look-up: how far in front of the seen surface does x lie?
+A scan point says that the straight line from the sensor to it was empty. One range image for each
+sensor turns this into a look-up: how far in front of the surface seen there does a point lie?
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_PIXELS = 4_000_000
 LEAST_RAY_POINTS = 16
 # A ray that grazes the surface says little about depth across it: 80° is the limit used.
 MIN_COSINE = 0.17
-# Where in its pixel a ray went nobody knows: standard deviation of an even spread over it.
+# A ray may have gone anywhere in its pixel: standard deviation of an even distribution over it.
 PIXEL_SIGMA = 1.0 / np.sqrt(12.0)
 # How deep rays pass is found to this power of two of a pixel, or of what they have passed.
 DEPTH_HALVINGS = 5
@@ -89,10 +89,11 @@ def range_images(scan: Scan) -> tuple[RangeImage, ...]:
 def clearances(
     images: tuple[RangeImage, ...], points_mm: Points, unseen_mm: float
 ) -> tuple[Values, Values]:
-    """How far points lie in front of what was seen, mm: the emptiest of what range images say.
+    """How far points lie in front of the seen surface, mm: a best and a cautious estimate.
 
-    And of their cautious answers, the least around a pixel. Measured across the seen surface;
-    `unseen_mm` is the answer where none of them saw anything.
+    Of several range images the one counts that shows the most empty space. The cautious estimate
+    takes the least depth around a pixel. Distances are measured across the seen surface;
+    `unseen_mm` is the answer where no image shows anything.
     """
     best, least = (np.full(len(points_mm), unseen_mm) for _ in range(2))
     for image in images:
@@ -106,10 +107,10 @@ def clearances(
 def rays_crossing(
     scan: Scan, near_mm: Float[np.ndarray, "a 2"], within_mm: float, height_mm: float, top_mm: float
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 2"]]:
-    """Points below `top_mm` whose rays cross a height near some places; and where they do.
+    """Points below `top_mm` whose rays cross a height near some places, and where they cross it.
 
     All that cross it within a distance of any of the places, as seen from above, and a few more.
-    None where the sensors are unknown.
+    There are none where the sensors are not known.
     """
     if scan.sensors_mm is None or scan.sensor_index is None:
         return np.zeros(0, np.int64), np.zeros((0, 2))
@@ -127,14 +128,14 @@ def rays_crossing(
 
 @dataclass(frozen=True, slots=True)
 class Passed:
-    """Places of a surface that rays passed where they should have ended.
+    """Surface points through which rays passed, though they should have ended there.
 
     Attributes
     ----------
     which
-        (c,) their numbers.
+        (c,) the numbers of these surface points.
     depth_mm, error_mm
-        (c,) how deep below them rays still pass, and its standard error.
+        (c,) how deep below each of them rays still pass, and the standard error of that depth.
     """
 
     which: Numbers
@@ -143,11 +144,12 @@ class Passed:
 
 
 def passed(images: tuple[RangeImage, ...], surface_mm: Points, normals: Points) -> Passed:
-    """Which places of a surface rays passed, and how deep below it they do without a gap.
+    """Find the surface points through which rays passed, and how deep below each they still pass.
 
-    A ray that grazes an edge sees far beyond it, whatever hair's breadth it passed inside: what
-    counts is how deep below the surface rays still pass. From the surface down, since on the far
-    side of a sound part rays pass again: by pixels, then by as much as was passed, then halved.
+    A ray that cuts an edge by a hair's breadth may end far beyond it, so where a ray ends says
+    little. What counts is the depth below the surface down to which rays pass without a gap; on the
+    far side of a sound part rays pass again. The depth is searched from the surface down, first by
+    a pixel, then in doubling steps, and at last by bisection.
     """
     beyond_mm = clearances(images, surface_mm, -np.inf)[1]
     which = np.flatnonzero(beyond_mm > 0)
@@ -172,7 +174,7 @@ def passed(images: tuple[RangeImage, ...], surface_mm: Points, normals: Points) 
         stopped_mm = np.where(deeper, stopped_mm, middle_mm)
     at_mm = surface_mm - passed_mm[:, None] * normals
     error_mm = np.full(len(which), np.inf)
-    for image in images:  # the squarest of the rays that went so deep tells it best
+    for image in images:  # of the rays that went so deep the squarest one tells the depth best
         went = clearances((image,), at_mm, -np.inf)[1] > 0
         own_mm = np.where(went, image.passing_error(at_mm, normals), np.inf)
         error_mm = np.minimum(error_mm, own_mm)

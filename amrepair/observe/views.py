@@ -1,4 +1,4 @@
-"""Views that contradict the others: which, and by how much, where several saw the same place."""
+"""Views of a scan compared with each other, and those that contradict the others found."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from amrepair.arrays import Mask, Numbers, Values
 from amrepair.observe.basis import USUAL_NUISANCE
 from amrepair.observe.robust import MAD_TO_SIGMA
 
-LEAST_PLACES = 30  # that a view shares with others: fewer tell nothing of it
-# Two views contradict each other alike, within so much: the template says which of them is off.
+LEAST_PLACES = 30  # a view that shares fewer places with others cannot be compared
+# Of two views that disagree, each contradicts the other: within this factor they count as equally
+# bad, and the template tells which of them is off.
 CONTRADICT_ALIKE = 1.1
 
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Which view says what of which place: (n,) places, views, deviations, numbers of points."""
+    """What each view says of each place: (n,) places, views, mean deviations, numbers of points."""
 
     place: Numbers
     view: Numbers
@@ -25,7 +26,7 @@ class Shares:
     count: Numbers
 
     def gathered(self) -> Shares:
-        """What a view says several times of one place as one, the places rising."""
+        """The same with a single entry for each place and view, ordered by places."""
         views = int(self.view.max(initial=0)) + 1
         key = self.place * views + self.view
         count = np.bincount(key, self.count)
@@ -35,12 +36,12 @@ class Shares:
 
     @property
     def views(self) -> Numbers:
-        """(n,) how many views saw the place of each."""
+        """(n,) how many views saw the place of each entry."""
         return np.bincount(self.place)[self.place]
 
     @property
     def apart_mm(self) -> float | None:
-        """Standard deviation of what views say of one place; None where no place had several."""
+        """Robust standard deviation between views of a place; None where none has several views."""
         views = self.views
         several = views > 1
         if not several.any():
@@ -50,7 +51,7 @@ class Shares:
         return MAD_TO_SIGMA * float(np.median(np.abs(off_mm) * np.sqrt(views / (views - 1.0))))
 
     def some(self, which: Mask) -> Shares:
-        """Some of them."""
+        """The chosen entries."""
         return Shares(self.place[which], self.view[which], self.value_mm[which], self.count[which])
 
 

@@ -1,4 +1,4 @@
-"""The limits a process profile sets on what is printed without asking."""
+"""The limits that a process profile sets on repairs that are printed without asking."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gcode.profiles import ProcessProfile
 def exceeded(
     limits: ProcessProfile, *, missing_mm3: float, print_time_s: float, unreachable_mm3: float
 ) -> str:
-    """The first limit that a repair exceeds, with both values; empty if none."""
+    """Says which limit a repair exceeds first, with both values; empty if it exceeds none."""
     if missing_mm3 > limits.unasked_max_mm3:
         return (
             f"{missing_mm3:.0f} mm³ is missing, the profile allows "

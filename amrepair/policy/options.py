@@ -1,4 +1,4 @@
-"""The numbers of the policy, each once, with its unit and its reason."""
+"""The numbers of the policy, each with its unit and its reason."""
 
 from __future__ import annotations
 
@@ -14,47 +14,51 @@ class PolicyOptions:
     Attributes
     ----------
     least_mm3
-        A defect below is left: heat beside the wound must be worth it. It is a bead 11 mm long,
-        half of the least that skipped lines leave; clean prints show less (`bench_clean.py`).
+        The least volume of a defect that is repaired; a smaller one is not worth the heat beside
+        it. It is a bead 11 mm long, and half of the least that skipped lines leave. Clean prints
+        show less (`bench_clean.py`).
     least_skipped_mm3
-        The same where lines of the job are gone: rays that went through are surer than a shallow
-        hollow. A clean look's crumbs, 0.9 mm³ together where a layer's lines lie rough, are below.
+        The same where lines of the job are missing, since rays that went through are more certain
+        than a shallow hollow. Crumbs of a clean look, 0.9 mm³ together where a layer's lines lie
+        rough, are each below it.
     line_mm3
-        What a gone line lacks at least to be counted with others: 2 mm of one of 0.4 × 0.2 mm.
+        A missing line shorter than this is not counted together with distant ones: 2 mm of a line
+        of 0.4 × 0.2 mm.
     crumb_mm3
-        Less than a short bead: it joins nothing, and is worth nothing.
+        A piece smaller than a short bead is no defect and part of none.
     one_defect_mm
-        What lies this near to a defect belongs to it.
+        Pieces no farther apart than this are one defect.
     least_excess_mm3
-        What stands out and is less is a seam or two; nothing takes so little away.
+        Excess below this is a seam or two, and is ignored.
     excess_layers
-        Standing out less than this, material is ploughed by the layers after it.
+        Excess lower than this many layers is flattened by the layers after it.
     sure
-        Confidence from which a run is ended, or halted, without another look.
+        From this confidence on a run may be stopped or paused without another look.
     doubtful
-        Confidence below which another look is taken.
+        Below this confidence another look is taken first.
     thin_layers
-        A bead laid into less than this has no room under the nozzle.
+        Missing material thinner than this many layers leaves no room for a bead of its own.
     one_layer
-        What is lower than this, noise and all, lies within one layer.
+        A region lower than this many layers, noise included, lies within a single layer.
     least_layers
-        Less than this is within what a layer's beads differ by themselves.
+        A deviation below this many layers is how a layer's beads differ anyhow.
     least_hit_mm3
-        A drop 0.6 mm across: less bends away, or melts under the nozzle.
+        Excess in the head's way counts from this volume on, a drop 0.6 mm across; a smaller one
+        bends away or melts under the nozzle.
     lost_ratio
-        An object of which more is gone has nothing left that a repair could stand on.
+        Where more than this share of an object is missing, too little is left to repair it on.
     least_reach_ratio
-        Where the nozzle reaches less than this share, nothing can be reached.
+        Where the nozzle reaches less than this share, it counts as reaching nothing.
     most_passes
-        Repairs at one stop.
+        How many repairs one stop may have.
     stuck_ratio
-        A repair that leaves more than this share of what it found has met something else.
+        Where a repair leaves more than this share of what was missing, it is not repeated.
     little_ratio
-        Less than this share of what was found at a stop is not worth another pass.
+        Where less than this share of what was found at a stop is left, no further pass is made.
     buried_mm3
-        What stays open inside and is less, 5 × 5 × 0.4 mm, is spanned by the layers over it.
+        A smaller void under later layers (5 × 5 × 0.4 mm) is bridged by them, and is accepted.
     left_ratio
-        Of what was found in the job: so much may be left, or stand out, within tolerance.
+        This share of what was found in the job may be left, or stand out, within tolerance.
     """
 
     least_mm3: float = 1.0
@@ -80,4 +84,4 @@ class PolicyOptions:
 
 
 USUAL_POLICY = PolicyOptions()
-"""What the loop and the command line go by."""
+"""The default of the loop and the command line."""

@@ -1,4 +1,4 @@
-"""A recorded decision made again from its facts: no scan, no plan, no printer."""
+"""Replay: a recorded decision is made again from its facts alone, perhaps by other options."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _MEANT: dict[str, type[DefectType] | type[Cover] | type[Action]] = {
 
 
 def decided_again(recorded: Mapping[str, Any], options: PolicyOptions = USUAL_POLICY) -> Decision:
-    """What the tables say of a decision's own facts (`Decision.to_json`).
+    """Decide again from the facts that a decision recorded (`Decision.to_json`).
 
-    What the facts themselves rest on stays as it was: whether a pass was the last, or changed
-    little.
+    The facts stay as they were recorded, even those that were themselves derived by the options of
+    that time: whether a pass was the last, or changed little.
 
     Raises
     ------

@@ -1,8 +1,10 @@
-"""Decisions as a table: what is done about a finding, and what then happens at the stop.
+"""Decisions as two tables: what is done about each finding, and then what happens at the stop.
 
-Both tables are data: rows with conditions and a reason, the first that fits counts. The page
-`docs/explanation/decisions.md` is made from them, and a test holds it to that. Facts come from
-`findings`; nothing is measured, printed or asked here.
+Both tables are data: rows of conditions with an action and its reason, of which the first that fits
+counts. `FINDINGS` decides about each region by itself (`judge`); `STOP_ROWS` decides about the stop
+as a whole, by the gravest of those decisions (`decide`). The page `docs/explanation/decisions.md`
+is made from the tables, and a test compares them. The facts come from `amrepair.loop.findings` and
+`amrepair.loop.situation`.
 """
 
 from __future__ import annotations
@@ -13,12 +15,12 @@ from enum import StrEnum
 from typing import Any
 
 from amrepair.policy.options import USUAL_POLICY, PolicyOptions
-from amrepair.policy.ways import Way
+from amrepair.policy.remedies import Way
 from amrepair.regions.anomaly import DefectType
 
 
 class Action(StrEnum):
-    """What can be decided, the gravest first."""
+    """What can be decided, from the gravest down."""
 
     STOP = "stop"
     PAUSE = "pause and ask"
@@ -32,7 +34,7 @@ class Action(StrEnum):
 
 
 class Cover(StrEnum):
-    """What the job lays over a place in its next layer."""
+    """What the job will lay over a place with its next layer."""
 
     NOTHING = "nothing"
     OPEN = "open infill"
@@ -41,35 +43,42 @@ class Cover(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One region, as far as the table looks at it.
+    """The facts about one region that the table looks at.
 
     Attributes
     ----------
     kind
         `missing` or `excess`.
     confidence
-        That it is there and is of that type, 0 to 1.
+        How sure it is, from 0 to 1, that the region is there and is of this type.
+    volume_mm3
+        Volume of the region.
     defect_mm3
-        Volume of the defect that it is a piece of: with what lies beside it; a crumb has none.
+        Volume of the whole defect that the region is a piece of (`acceptance.defect_volumes`).
     thickness_layers, height_layers
-        Mean thickness, and from lowest to highest point, in layers of the job.
+        Mean thickness, and height from the lowest to the highest point, in layers of the job.
     reachable_ratio
-        Share that the nozzle reaches; 1 where nobody has asked yet.
+        Share of it that the nozzle reaches; 1 where that has not been asked.
+    cover
+        What the job will lay over it with its next layer.
     hit_mm
         How deep the head would run into it on the job's next moves; 0 if it clears it.
     box_mm
         Lowest and highest corner, build frame.
+    seen_twice
+        Whether this stop was looked at again already, with nothing printed in between.
     skipped
-        A line of the job that is not there lies in it: its room is a bead's.
-    object
-        Which of several objects of the job, not given up yet, it lies in; empty: in none.
-    lost_ratio
-        Share of what the job has laid of that object that is missing, all its regions together.
-    given_up
-        It lies in an object that has been given up.
+        Whether a missing line of the job lies in it, so that a bead fits.
     layer_off
-        The layer's top lies off its plane there by more than tolerance and its own scatter
-        explain (`layer_level`): what the next layer's flow is changed for.
+        Whether the layer's top lies off its plane there by more than the tolerance and the layer's
+        own scatter explain (`loop.layer_level`). Only then is the next layer's flow changed.
+    object
+        The object of the job in which it lies; empty where the job prints only one, or where the
+        region lies in none.
+    lost_ratio
+        Share of that object, as far as it is printed, that is missing in all its regions together.
+    given_up
+        Whether it lies in an object that has been given up.
     """
 
     kind: str
@@ -93,25 +102,26 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What the second table looks at, beside the findings' own decisions.
+    """The facts about a stop that the second table looks at.
 
     Attributes
     ----------
     gravest
-        The gravest decision of a finding; `fill now` counts only as long as it is worth another
-        pass.
+        The gravest action that was decided for a finding.
     seen_twice
-        This stop was looked at again already, nothing printed between.
+        Whether this stop was looked at again already, with nothing printed in between.
     refused
-        The checker refuses the patch, or nothing of it is left to print.
+        Whether the checker refuses the patch, or nothing of the patch is left to print.
     last_pass, stuck, little_left
-        Why another pass would not help.
+        Reasons against another pass: as many as allowed were made; the last one changed little;
+        little is left (`stopping_criteria`).
     beyond
-        A limit of the profile that the repair would exceed, where nobody is asked; else empty.
+        Where repairs are printed unasked: the limit of the profile that this one exceeds. Else
+        empty.
     buried_mm3
-        What stays open under layers that were printed since, however the stop is left.
+        Volume that stays open under layers that were printed since, however the stop ends.
     other_material
-        What is in the nozzle, where it is not the material of what is missing; else empty.
+        The material in the nozzle, where what is missing is of another one; else empty.
     """
 
     gravest: Action
@@ -127,12 +137,17 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One fact compared with one value.
+    """One condition of a row: a fact, compared with a value.
 
     Attributes
     ----------
+    fact
+        The name of an attribute of `Finding` or `Situation`.
+    test
+        `is` equal to the value, `in` one of several values, `stated` (not empty), `≥` or `<`.
     value
-        What it is to be; of a measure (`≥`, `<`) a number, or the name of one in `PolicyOptions`.
+        What the fact is compared with. For `≥` and `<` it may be the name of a number of
+        `PolicyOptions`.
     """
 
     fact: str
@@ -140,7 +155,7 @@ class Condition:
     value: Any
 
     def fits(self, facts: Finding | Situation, options: PolicyOptions = USUAL_POLICY) -> bool:
-        """Whether it holds."""
+        """Whether the condition holds."""
         found = getattr(facts, self.fact)
         if self.test == "is":
             return bool(found == self.value)
@@ -152,7 +167,7 @@ class Condition:
         return bool(found >= limit) if self.test == "≥" else bool(found < limit)
 
     def limit(self, options: PolicyOptions) -> float:
-        """What a measure is compared with: a number of the options, by its name, or itself."""
+        """The number that `≥` and `<` compare with; a name is looked up in the options."""
         return float(getattr(options, self.value) if isinstance(self.value, str) else self.value)
 
     def __str__(self) -> str:
@@ -214,13 +229,13 @@ class Row:
     reason: str
 
     def fits(self, facts: Finding | Situation, options: PolicyOptions = USUAL_POLICY) -> bool:
-        """Whether all its conditions hold."""
+        """Whether all conditions of the row hold."""
         return all(condition.fits(facts, options) for condition in self.when)
 
 
 ENDING_DEFECTS = (DefectType.DETACHED, DefectType.LAYER_SHIFT)
 BEYOND_MENDING = (*ENDING_DEFECTS, DefectType.WARP, DefectType.CLOG)
-"""What adding material cannot mend."""
+"""Defects that adding material cannot mend."""
 
 
 def _is(fact: str, value: object) -> Condition:
@@ -305,7 +320,7 @@ FINDINGS: tuple[Row, ...] = (
     Row("F14", Action.FILL_NOW, (_MISSING,),
         "a bead fits, and the nozzle reaches it"),
 )  # fmt: skip
-"""What is done about one finding."""
+"""What is done about one finding: the first row that fits counts."""
 
 _FILL = _is("gravest", Action.FILL_NOW)
 STOP_ROWS: tuple[Row, ...] = (
@@ -341,14 +356,14 @@ STOP_ROWS: tuple[Row, ...] = (
     Row("S12", Action.GO_ON, (),
         "nothing is left to decide"),
 )  # fmt: skip
-"""What happens at the stop."""
+"""What happens at the stop: the first row that fits counts."""
 
 _GRAVITY = tuple(Action)
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the table says of one finding."""
+    """The decision about one finding, with the row that made it."""
 
     finding: Finding
     action: Action
@@ -358,7 +373,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What was decided at a look, with all that it rests on."""
+    """What was decided at a look, with all the facts that led to it."""
 
     action: Action
     row: str
@@ -369,23 +384,23 @@ class Decision:
 
     @property
     def changes_next(self) -> tuple[Verdict, ...]:
-        """Findings that the next layer's flow is to carry, once the stop is left."""
+        """The findings for which the next layer's flow will be changed."""
         wanted = {Action.FILL_WITH_NEXT, Action.LOWER_NEXT}
         return tuple(verdict for verdict in self.verdicts if verdict.action in wanted)
 
     @property
     def own(self) -> tuple[Verdict, ...]:
-        """Findings that led to it."""
+        """The findings that led to this decision."""
         return tuple(verdict for verdict in self.verdicts if verdict.action is self.action)
 
     @property
     def told(self) -> list[str]:
-        """What it rests on and what can be done, in lines, for whoever is asked."""
+        """The reasons, and what can be done, as lines for the person who is asked."""
         own = [f"{verdict.finding.type}: {verdict.reason}" for verdict in self.own]
         return (own or [self.reason]) + [way.told for way in self.ways]
 
     def to_json(self) -> dict[str, Any]:
-        """As it stands in the run's record."""
+        """The decision as a run records it."""
         return {
             "action": str(self.action),
             "row": self.row,
@@ -401,23 +416,23 @@ class Decision:
 
 
 def judge(finding: Finding, options: PolicyOptions = USUAL_POLICY) -> Verdict:
-    """The first row that fits a finding."""
+    """Decide about one finding, by the first row that fits."""
     row = next(row for row in FINDINGS if row.fits(finding, options))
     return Verdict(finding, row.action, row.id, row.reason)
 
 
 def gravest(verdicts: Sequence[Verdict]) -> Action:
-    """The gravest of some decisions; `go on` where there are none."""
+    """The gravest action of some verdicts; `go on` where there are none."""
     return min((v.action for v in verdicts), key=_GRAVITY.index, default=Action.GO_ON)
 
 
 def decide(
     verdicts: Sequence[Verdict], situation: Situation, options: PolicyOptions = USUAL_POLICY
 ) -> Decision:
-    """What happens at the stop.
+    """Decide what happens at the stop.
 
-    A patch that is not to be printed does not hide what else was found: then the next gravest
-    counts.
+    Where filling is gravest but the patch is not to be printed, the other findings still count:
+    then the next gravest action decides, if it asks for anything.
     """
     row = next(row for row in STOP_ROWS if row.fits(situation, options))
     if situation.gravest is Action.FILL_NOW and row.action is Action.GO_ON:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amrepair.errors import InputError
-from amrepair.loop.marks import LOOK_MARK
+from amrepair.loop.marked_stops import LOOK_MARK
 from amrepair.loop.pace import layers_at, layers_every
 from amrepair.postprocess.covering import covered_mm2
 from amrepair.postprocess.lifted import over_finished

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Literal, get_args
 
 from amrepair.errors import InputError
-from amrepair.loop.marks import LOOK_MARK
+from amrepair.loop.marked_stops import LOOK_MARK
 from gcode.profiles.own_settings import own_settings
 
 Target = Literal["klipper", "prusa", "marlin", "reprap", "octoprint"]

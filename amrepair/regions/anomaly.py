@@ -1,4 +1,4 @@
-"""What detection says: a label for every scan point and every template surface point, regions."""
+"""The result of detection: labels of scan points and of the template's surface, and regions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from amrepair.field.as_built import Evidence
 from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.inspected import Inspected
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import Sites
 from amrepair.template.port import Template
 
 
 class Label(IntEnum):
-    """Labels as they stand in `anomaly.npz`."""
+    """Labels, numbered as in `anomaly.npz`."""
 
     OK = 0  # for template points: present
     MISSING = 1
@@ -30,7 +30,7 @@ class Label(IntEnum):
 
 
 class DefectType(StrEnum):
-    """Kinds of defects, in the words of the command line."""
+    """Types of defects, in the words of the command line."""
 
     VOID = "void"
     UNDER_EXTRUSION = "under_extrusion"
@@ -55,17 +55,19 @@ class Region:
     label
         MISSING or EXCESS.
     box_mm
-        (2, 3) lowest and highest corner.
+        (2, 3) lowest and highest corner of its box.
     depth_mm
         The largest |deviation| in it.
     below_bead
-        Too small for one bead to fix.
+        Whether it is too small for a single bead.
     confidence
-        That it is there and is of that type, 0 to 1; 1 where nobody has judged it.
+        How sure it is, from 0 to 1, that the defect is there and of this type; 1 where this was
+        not judged.
     skipped
-        Lines of the job are gone in it (`regions.skipped`).
+        Whether lines of the job are missing in it (`regions.skipped`).
     p_value
-        Expected number of false regions in a scan that stand out as much; NaN where no test was.
+        How many regions at least as significant a scan of a sound part is expected to show; NaN
+        where no test was made.
     """
 
     label: Label
@@ -92,7 +94,7 @@ class Region:
 
 @dataclass(frozen=True, slots=True)
 class AnomalyMap:
-    """Scores and labels, template frame.
+    """What was found on a scan and on the template's surface, template frame.
 
     Attributes
     ----------
@@ -103,32 +105,32 @@ class AnomalyMap:
     score
         (n,) A(x) = |f(x)| (PASDF, the anomaly score).
     label
-        (n,) `Label` of each scan point; background (bed, far clutter) is OK.
+        (n,) `Label` of each scan point; background (the bed, clutter) is OK.
     template_points_mm
-        (m, 3) template surface points.
+        (m, 3) points spread over the template's surface.
     template_label
-        (m,) OK (present), MISSING or UNSEEN.
+        (m,) `Label` of each of them: OK (present), MISSING or UNSEEN.
     threshold_mm, threshold_source
-        The limit and how it was set.
+        The deviation that counts as a defect, and how it came about, in a sentence.
     object_score
-        Mean of the K highest scores.
+        The mean of the K highest scores (PASDF).
     top_z_mm, top_threshold_mm
-        The plane of the layer just printed, under which a smaller limit holds; None where there
-        is none.
+        The plane of the layer just printed and the smaller threshold that holds under it; None and
+        infinite where there is no such plane.
     evidence, surfel_label, surfel_higher_mm
-        What the labels rest on, for the deficit, and (s,) how far out of the template each surfel
-        may be, by what normal parts differ and the process was told; None for a map read back
-        from a file.
-    sites
-        What the test looked at; None for a map read back from a file.
+        For the deficit: what the labels rest on, (s,) the label of each surfel, and (s,) how far
+        outside the template each surfel may lie without being excess. None for a map that was read
+        back from a file.
+    inspected
+        The places that were tested; None for a map read back from a file.
     noise, nuisance, contradicting
-        What the scan told of its errors, what belongs to the whole part (None where the pose is
-        told), and views that were left out.
+        The scan's errors as it tells them itself; what was subtracted as belonging to the whole
+        part (None where the pose was told); and the views that were left out.
     calibration, options
-        What stood in for the scan's own word on its errors, and what the test was set to.
+        The calibration that was used in place of the scan's own errors, if any, and the options.
     chance_mm
-        By rising width of windows: how far beyond what is allowed sound places may seem to lie too
-        low by chance, in the narrowest; in wider ones, those where the scanner errs most.
+        Pairs of a window's width and a depth, by rising width: how far beyond the tolerance a
+        sound place may seem to lie too low by chance.
     """
 
     points_mm: Points
@@ -146,7 +148,7 @@ class AnomalyMap:
     surfel_higher_mm: Float[np.ndarray, " s"] | None = None
     top_z_mm: float | None = None
     top_threshold_mm: float = np.inf
-    sites: Sites | None = None
+    inspected: Inspected | None = None
     noise: Noise | None = None
     nuisance: Nuisance | None = None
     contradicting: tuple[Contradiction, ...] = ()
@@ -155,18 +157,18 @@ class AnomalyMap:
     chance_mm: tuple[tuple[float, float], ...] = ()
 
     def expected(self, template: Template) -> Template:
-        """The template that labels and evidence are held against: as the whole part was made."""
+        """The template as the whole part was made, to which labels and evidence refer."""
         return as_made(template, self.nuisance)
 
     def told_over_mm(self, deep_mm: float) -> float:
-        """Over what length something so deep is told from errors; 0: over as little as any is."""
+        """Over which length something so deep is told from errors; 0 if the least will do."""
         far_off = [k for k, (_, off_mm) in enumerate(self.chance_mm) if off_mm > deep_mm]
         if not far_off:
             return 0.0
         return [*(width_mm for width_mm, _ in self.chance_mm), np.inf][far_off[-1] + 1]
 
     def told(self) -> tuple[str, ...]:
-        """What belongs to the whole part or to whole views, or was not judged, in sentences."""
+        """Sentences on what belongs to the whole part or a whole view, or was not judged."""
         whole = () if self.nuisance is None else self.nuisance.told()
         by = self.calibration
         judged = () if by is None or by == NORMAL_NOISE else (by.told(),)

@@ -18,17 +18,17 @@ from amrepair.frames import cells_of, in_box
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import fit_nuisance
 from amrepair.observe.options import BackgroundOptions
-from amrepair.regions.calibrating import (
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration_fit import (
     NONE_FAR_OFF,
     Sound,
     by_width,
     calibrated,
     sound_scales,
 )
-from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import Level, tested
-from amrepair.regions.sites import Sites
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
 
@@ -117,7 +117,7 @@ def _levels(
         tolerance_mm=tolerance_mm,
         correlation_mm=options.correlation_mm,
     )
-    sites = Sites(
+    inspected = Inspected(
         cells=n,
         cell_mm=surfels.cell_mm,
         place_mm=surfels.place_mm,
@@ -129,7 +129,7 @@ def _levels(
         pose_mm=np.zeros(n),
     )
     return tested(
-        sites, replace(options, process_sigma_mm=0.0, most_windows=options.bed_windows), None
+        inspected, replace(options, process_sigma_mm=0.0, most_windows=options.bed_windows), None
     )
 
 

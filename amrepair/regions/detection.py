@@ -1,4 +1,4 @@
-"""Detection: from an aligned scan to regions, each with how sure it is."""
+"""Detection: from an aligned scan to regions, each with its significance. Begin reading here."""
 
 from __future__ import annotations
 
@@ -10,24 +10,17 @@ from amrepair.field.as_built import Evidence, gather, with_stubs
 from amrepair.field.groups import group_points, touching_mm
 from amrepair.observe.rays import RangeImage
 from amrepair.regions.anomaly import AnomalyMap, Label
-from amrepair.regions.calibrating import Sound, sound_scales
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration_fit import Sound, sound_scales
+from amrepair.regions.inspected import Inspected, OffByJob, inspected_of, tolerances
 from amrepair.regions.labels import grown
 from amrepair.regions.noise import Noise, noise_of
+from amrepair.regions.observation import Observed, observed
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.regions import Tested, find_regions
 from amrepair.regions.significance import LEAST_PEAKS, Level, as_student, tested
-from amrepair.regions.sites import (
-    Observed,
-    OffByJob,
-    PoseKnown,
-    Sites,
-    agreed,
-    observed,
-    sites_of,
-    tolerances,
-)
 from amrepair.regions.strands import on_strands
+from amrepair.regions.systematic import PoseKnown, without_systematic_errors
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 from gcode.progress import Progress, silent
@@ -52,25 +45,29 @@ def detect(
     ----------
     scan
         In the template's frame.
+    template
+        The expected shape.
     options
-        What the test is set to; None takes the defaults.
+        Settings of the test; None takes the defaults.
     calibration
-        What sound parts look like to this scanner; None: as the scan itself tells, and so, too,
-        where normal noise is given and the scan itself contradicts.
+        The errors of this scanner on sound parts. None estimates them from the scan itself; so does
+        `NORMAL_NOISE` where the scan contradicts it.
     top_z_mm
-        Height of the layer just printed, where the template ends there: what is missing under
-        that plane is judged with `top_allowance_mm`, since the job says exactly where it lies.
-    images
-        What the scan's rays saw (`range_images`), where it is known already.
-    surface
-        The template's surface points, `spacing_mm` apart, and normals, where they are.
+        Height of the layer just printed, where the template ends there. What is missing under that
+        plane is judged with the smaller `top_allowance_mm`, since the job says exactly where the
+        plane lies.
+    images, surface
+        The scan's range images, and points (`spacing_mm` apart) and normals of the template's
+        surface, where the caller has them already.
     off_by_job
-        Of places and their deviations: how far off the template, on that side, the job's own path
-        may put the surface there. So much is not excess, and not missing.
+        A function of places and their deviations: how far off the template the job's own path may
+        put the surface there, on that side. So much is neither excess nor missing.
     pose
-        How well the scan's pose is known. Of a part that stands on its bed a bow and what it has
-        shrunk by are told and taken out, but no top that lies higher or lower as a whole. Where the
-        pose is told, as under `top_z_mm`, nothing is.
+        How well the scan's pose is known. `free`: residual pose, scale and bow are estimated and
+        taken out. `stands`, of a part on its bed: scale and bow, but no shift of the whole top up
+        or down. `told`, as always with `top_z_mm`: nothing is taken out.
+    progress
+        Told how far detection is.
 
     Raises
     ------
@@ -91,15 +88,16 @@ def detect(
     options = options or RegionOptions()
     progress("detect", 0.0, 4.0)
 
-    def observe(without: tuple[int, ...]) -> tuple[Observed, Sites]:
+    def observe(without: tuple[int, ...]) -> tuple[Observed, Inspected]:
         seen = observed(scan, template, options, images, surface, without)
-        return seen, sites_of(seen, options, top_z_mm, off_by_job)
+        return seen, inspected_of(seen, options, top_z_mm, off_by_job)
 
-    # a layer that lacks as a whole is no pose: how high its top lies the job has said
+    # if a whole layer is too low, that must not be taken for an error of the pose: the job says
+    # how high the top lies
     held = "told" if top_z_mm is not None else pose
-    seen, sites, nuisance, contradicting = agreed(observe, held, options)
+    seen, inspected, nuisance, contradicting = without_systematic_errors(observe, held, options)
     progress("detect", 1.0, 4.0)
-    test = _tested(seen, sites, options, calibration)
+    test = _tested(seen, inspected, options, calibration)
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, options)
     progress("detect", 3.0, 4.0)
@@ -107,7 +105,7 @@ def detect(
     score = np.abs(seen.f_mm)
     k = min(options.top_k, int(seen.keep.sum()))
     surfel_label = np.where(test.missing, int(Label.MISSING), test.excess * int(Label.EXCESS))
-    allowed_mm = sites.tolerance_mm[1] - sites.tolerance_mm[0]
+    allowed_mm = inspected.tolerance_mm[1] - inspected.tolerance_mm[0]
     progress("detect", 4.0, 4.0)
     return AnomalyMap(
         points_mm=scan.points_mm,
@@ -125,7 +123,7 @@ def detect(
         evidence=evidence,
         surfel_label=surfel_label,
         surfel_higher_mm=np.maximum(allowed_mm[: len(seen.surfels)], 0.0),
-        sites=sites,
+        inspected=inspected,
         noise=test.noise,
         nuisance=nuisance,
         contradicting=contradicting,
@@ -136,27 +134,27 @@ def detect(
 
 
 def _tested(
-    seen: Observed, sites: Sites, options: RegionOptions, calibration: Calibration | None
+    seen: Observed, inspected: Inspected, options: RegionOptions, calibration: Calibration | None
 ) -> Tested:
-    """Test every scale, and grow regions from where it is significant."""
+    """Test local means at every scale, and grow regions from the significant places."""
     cells, gone_to = len(seen.surfels), len(seen.surfels) + len(seen.crossed.which)
-    levels = tested(sites, options, calibration)
+    levels = tested(inspected, options, calibration)
     if calibration == NORMAL_NOISE and _erratic(levels, options):  # the scan itself contradicts
-        levels, calibration = tested(sites, options, None), None
-    # what errors leave in strips neither a scan nor a calibration tells: only where they are known
-    # to be normal is there any
+        levels, calibration = tested(inspected, options, None), None
+    # neither a scan nor a calibration tells what errors look like in narrow strips, so strands are
+    # looked for only where errors are known to be normal
     strands = np.zeros(len(seen.surfels), bool)
     if calibration == NORMAL_NOISE:
-        strands = _strands(seen, sites, levels, options)
+        strands = _strands(seen, inspected, levels, options)
     tolerances_mm = tolerances(options, seen.template)
     labels, log_p = grown(
-        levels, sites.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
+        levels, inspected.tolerance_mm, options, anywhere_mm=tolerances_mm[0], strands=strands
     )
     gone = np.zeros(len(seen.surface_mm), bool)
     gone[seen.crossed.which] = labels[0, cells:gone_to]
     gone_p_value = np.ones(len(seen.surface_mm))
     gone_p_value[seen.crossed.which] = np.exp(log_p[0, cells:gone_to])
-    # an end speaks for the cell that its points are part of
+    # the label of a wall's end goes to the cell that its points belong to
     ended = seen.ends.surfel[labels[0, gone_to:]]
     labels[0, ended], labels[1, ended] = True, False
     np.minimum.at(log_p[0], seen.ends.surfel, log_p[0, gone_to:])
@@ -177,19 +175,20 @@ def _tested(
 
 
 def _erratic(levels: tuple[Level, ...], options: RegionOptions) -> bool:
-    """Whether so many places stand out as tell a tail, and not all of them to one side.
+    """Whether the scan has more outliers than normal noise, on both sides of the template.
 
-    What went wrong with a print is too much or too little; a scanner's errors are both. Places
-    beyond what is allowed by `grow_sigmas`: normal noise alone leaves hardly one.
+    A defect of a print lies to one side, missing or excess, while a scanner's errors lie on both.
+    An outlier is a place beyond the tolerance by `grow_sigmas`, of which normal noise leaves hardly
+    any.
     """
     low, high = (int((peaks > options.grow_sigmas).sum()) for peaks in levels[0].peaks)
     return min(low, high) > 0 and low + high >= LEAST_PEAKS
 
 
 def _chance_mm(test: Tested) -> tuple[tuple[float, float], ...]:
-    """By rising width of windows, how low sound places may seem to lie by chance.
+    """How low sound places may seem to lie by chance, for windows of rising width.
 
-    In wider windows than the narrowest, what lies far off, where a calibration knows that.
+    Wider windows than the narrowest use the calibration's outliers, where there is a calibration.
     """
     told: list[tuple[float, float]] = []
     for level in test.levels[1:]:
@@ -200,7 +199,7 @@ def _chance_mm(test: Tested) -> tuple[tuple[float, float], ...]:
 
 
 def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evidence, Numbers]:
-    """What is known of the space around regions, and of each place of the template's surface."""
+    """What is known of the space around the regions, and the label of each template point."""
     labelled = test.missing | test.excess
     evidence = gather(
         seen.scan,
@@ -216,27 +215,27 @@ def _bounded(seen: Observed, test: Tested, options: RegionOptions) -> tuple[Evid
 
 
 def judged_scales(anomaly: AnomalyMap) -> Sound:
-    """What a scan of a sound part shows of its errors, for a calibration to learn from.
+    """The errors that a scan of a sound part shows, from which a calibration is made.
 
-    As the scan itself tells, whatever calibration it was judged by.
+    The scan is tested again without any calibration, whatever it was judged by.
     """
-    assert anomaly.sites is not None
+    assert anomaly.inspected is not None
     assert anomaly.options is not None
-    return sound_scales(tested(anomaly.sites, anomaly.options, None), anomaly.options)
+    return sound_scales(tested(anomaly.inspected, anomaly.options, None), anomaly.options)
 
 
 def _strands(
-    seen: Observed, sites: Sites, levels: tuple[Level, ...], options: RegionOptions
+    seen: Observed, inspected: Inspected, levels: tuple[Level, ...], options: RegionOptions
 ) -> Mask:
-    """(n,) cells of strips narrower than any window that stand out along their length.
+    """(n,) cells of strips that stand out along their length, but are narrower than any window.
 
-    By how much more than each cell may: what the job itself lays, as supports, stands out too.
+    Each cell's own tolerance counts, since what the job lays itself, as supports, stands out too.
     """
     surfels = seen.surfels
     first = levels[1]
     cells = slice(len(surfels))
     usual_mm = float(np.median(first.tolerance_mm[1]))
-    higher_mm = sites.value_mm[cells] - sites.tolerance_mm[1, cells] + usual_mm
+    higher_mm = inspected.value_mm[cells] - inspected.tolerance_mm[1, cells] + usual_mm
     per_point_mm = float(np.median(first.scale.noise_mm) * np.sqrt(np.median(surfels.count)))
     # of what is as narrow as a few cells, errors have a tail as long as that of those cells
     critical = float(max(first.critical[1], levels[0].critical[1]))
@@ -252,10 +251,11 @@ def _strands(
 
 
 def _stray_limit_mm(test: Tested, options: RegionOptions) -> float:
-    """How far from the template a cell is broken off: beyond δ's share, and how cells stray.
+    """From which distance to the template on a cell counts as broken surface.
 
-    Of all cells as many stray farther from their neighbours as of normal noise lie beyond
-    `grow_sigmas`: the tail of a real scanner's errors counts.
+    A share of the tolerance, and beyond it what cells stray from their neighbours by noise: the
+    same quantile of the scan's own strays as `grow_sigmas` is of normal noise, so that the long
+    tail of a real scanner's errors counts.
     """
     level = test.levels[0]
     tolerance_mm = options.grow_share * float(np.median(level.tolerance_mm[0]))
@@ -267,7 +267,7 @@ def _stray_limit_mm(test: Tested, options: RegionOptions) -> float:
 
 
 def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
-    """How the limit came about, in a sentence."""
+    """How the threshold came about, in a sentence."""
     if options.tolerance_mm is not None:
         tolerance = f"given tolerance {options.tolerance_mm:g} mm"
     else:
@@ -282,7 +282,7 @@ def _source(options: RegionOptions, template: Template, noise: Noise) -> str:
 
 
 def _label_surface(seen: Observed, evidence: Evidence, test: Tested) -> Numbers:
-    """Present where scanned surface lies on it, missing where seen to be gone, else unseen."""
+    """Labels of template points: OK where scanned surface lies, MISSING where gone, else UNSEEN."""
     surfels, surface_mm = evidence.surfels, seen.surface_mm
     missing, limit_mm = test.missing, test.limit_mm
     present = (seen.nearest >= 0) & ~missing[seen.nearest]

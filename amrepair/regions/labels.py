@@ -1,4 +1,4 @@
-"""Labels: which cells of a field belong to a region, grown from where the test is significant."""
+"""Labels: which places belong to a region, grown from those where the test is significant."""
 
 from __future__ import annotations
 
@@ -22,15 +22,25 @@ def grown(
     anywhere_mm: float,
     strands: Mask,
 ) -> tuple[Bool[np.ndarray, "2 b"], Float[np.ndarray, "2 b"]]:
-    """(2, b) cells of missing and of excess regions, and how sure the windows over each are.
+    """Grow regions from significant windows, for missing and for excess.
 
-    `anywhere_mm` is δ where nothing more is allowed, `strands` are cells that stand out as strips.
-    The second is the logarithm of the expected number of false regions, over all that is tested.
+    A region grows through touching cells for as long as a cell lies beyond the noise and a share
+    of the tolerance, and so does the median of a window beside it. Where the tolerance is larger
+    than usual, by the job or by how sound parts differ, all of it has to be exceeded.
 
-    From every window that is significant a region grows through touching cells of the field for as
-    long as they are beyond the noise and a share of the tolerance, and so is the median of a window
-    beside them. Where more is allowed than anywhere, by the job or by what sound parts differ by,
-    all of that is none of a region.
+    Parameters
+    ----------
+    tolerance_mm
+        The tolerance of each place.
+    anywhere_mm
+        The usual tolerance, of places where nothing more is allowed.
+    strands
+        Cells that stand out as narrow strips: regions of excess begin there, too.
+
+    Returns
+    -------
+    (2, b) whether each place belongs to a region of missing and of excess; and (2, b) the logarithm
+    of the expected number of false regions at least as significant, over all tests.
     """
     first, scale = levels[0], levels[0].scale
     value_mm = scale.value_mm[scale.of_base]
@@ -69,7 +79,7 @@ def grown(
 
 
 def _beside(scale: Scale, chosen: Mask) -> Mask:
-    """(b,) whether a cell is chosen, or one that touches it."""
+    """(b,) whether a cell, or one that touches it, is chosen."""
     if not chosen.any():
         return chosen
     cells_mm = scale.place_mm[np.unique(scale.of_base[chosen])]
@@ -77,7 +87,7 @@ def _beside(scale: Scale, chosen: Mask) -> Mask:
 
 
 def _reached(scale: Scale, seeds: Mask, through: Mask) -> Mask:
-    """(b,) cells in `through` that hang together with a seed, whichever way they face."""
+    """(b,) cells of `through` that are connected to a seed, whichever way they face."""
     reached = np.zeros(len(through), bool)
     if not seeds.any():
         return reached

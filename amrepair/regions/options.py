@@ -1,4 +1,4 @@
-"""What the test is set to: each number once, with its unit and where it comes from."""
+"""Options of detection: each number once, with its unit and where it comes from."""
 
 from __future__ import annotations
 
@@ -12,53 +12,59 @@ from amrepair.template.laid import SUNK_LAYERS
 
 @dataclass(frozen=True, slots=True)
 class SkippedOptions:
-    """Lines of the job that rays went through.
+    """How missing lines of the job are found, by rays that went through them.
 
     Attributes
     ----------
     sample_step_mm, samples_together
-        Samples along a line, and so many of them are judged together.
+        Distance between samples along a line, and how many samples are judged together.
     least_stretch_mm
-        Shorter stretches are seams and corners.
+        Shorter missing stretches are seams and corners.
     joined_mm, straight_on
-        A line goes on in the next that begins where it ends, unless it turns there by more than
-        45° (cosine): that is a corner, and plastic cuts it.
+        A line continues in the next one if that begins within `joined_mm` of its end and turns by
+        no more than 45° (`straight_on` is the cosine). A sharper turn is a corner, which plastic
+        cuts short.
     gone_share, sure_share
-        How far in the open a bead lies where it is gone, on the whole of a stretch, by the rays
-        that meet its core: −1 on its top, 1 on its floor. Half of its plastic is 0, and pixels
-        beside a silhouette let rays run past a wall. And over half of such a stretch, which must be
-        the surer.
+        A stretch is missing if it is this open on average, as told by the rays that meet its
+        core, where −1 is its top, 0 half of its plastic, and 1 its floor. It is missing, too, if
+        half as many samples are open by `sure_share`, which is higher for fewer. Both are
+        well above 0, since pixels beside a silhouette let rays run past a wall.
     gone_erring
-        The first of the two where the scanner errs: of 114 sound looks, most at parts never tuned
-        on, two told lines at 0.5 to 0.6, none at more.
+        Takes the place of `gone_share` where the scanner errs. Of 114 sound looks, most at parts
+        never tuned on, two showed lines as open as 0.5 to 0.6, none more.
     least_again_mm, same_layer_mm
-        In a layer of which a stretch is gone others may be shorter.
+        Least length of a further stretch in a layer where one is missing already; lines within
+        `same_layer_mm` of height are of one layer.
     errs_over, errs_along_mm, most_together_mm
-        Rays that end so many heights over a line's middle are errors that count. Where a scanner
-        errs a line is judged over so much at least, as recorded errors that lie far off are no
-        longer, and over so much at most.
+        Rays that end up to `errs_over` line heights above a line's middle show the scanner's
+        errors. Where it errs, a line is judged over at least `errs_along_mm`, since recorded
+        outliers are no longer than that, and at most over `most_together_mm`.
     below_line_mm, wall_mm, most_shift_mm, upright_wall
-        The walls that tell how far in a line stands: so far below the last lines' middles and so
-        deep, as far off as a part shrinks and no farther, and upright (cosine).
+        Which walls tell how far inside its plan a line stands: from `below_line_mm` below the top
+        lines' middles down by `wall_mm`, no farther off than `most_shift_mm`, as parts shrink no
+        more, and upright (a cosine).
     wall_cells, least_wall_cells, beside_wall_mm, same_wall
-        Of so many cells near a line those of the nearest wall (cosine), a few at least.
+        Of the `wall_cells` nearest cells within `beside_wall_mm` of a line, those of the nearest
+        wall count (`same_wall`, a cosine), if they are `least_wall_cells` or more.
     wall_share, wall_off_mm, shrinks_ratio
-        What one of all walls' cells is worth, as errors hang together along a wall, and what it
-        is off by as beads wander, where all of them tell how much the part is aside or has shrunk;
-        and by what share plastic shrinks: one standard deviation.
+        For the fit of shift, turn and shrinkage to all walls: how much a single cell counts, since
+        errors are correlated along a wall; its standard deviation, as beads wander; and the
+        standard deviation of the plastic's shrinkage.
     under_share
-        Of a line's width: a ray that meets it so near to its middle ends there.
+        A ray meets a line if it passes within this share of the line's width of its middle.
     held_places, alike, there_of_alike
-        Places across a line that rest on the layer below or not. How low a line over a rim lies, so
-        many samples of lines held alike tell, of which so many are taken to be there: over 50 mm.
+        At how many places across a line it is asked whether the layer below holds it. How low a
+        line over a rim may lie is told by `alike` samples of lines held alike, over 50 mm, of which
+        the share `there_of_alike` is taken to be there.
     held_share
-        Of a line's width: with less over what lies below a line hangs; walls that lean are held
-        by a sixth.
+        A line hangs if less than this share of its width lies over the layer below. Leaning walls
+        are held by a sixth.
     sunk_layers
-        So many layers over strands that hang lie lower by what strands hang lower.
+        So many layers over hanging strands lie lower, as those strands do.
     sunk_cells, least_sunk_cells, sunk_reach_mm, sunk_share
-        How much lower, so many of the nearest cells over strands tell, a few at least, no farther
-        off: of their depths this quantile, as of lines that are gone the floor lies deeper.
+        How much lower is told by the nearest cells over strands: at most `sunk_cells`, at least
+        `least_sunk_cells`, within `sunk_reach_mm`. The quantile `sunk_share` of their depths is
+        taken, since under a missing line the floor lies deeper.
     """
 
     sample_step_mm: float = 0.25
@@ -98,19 +104,21 @@ class SkippedOptions:
 
 
 USUAL_SKIPPED = SkippedOptions()
-"""What the deficit goes by."""
+"""The default of the deficit."""
 
 
 @dataclass(frozen=True, slots=True)
 class WallEndOptions:
-    """Broken ends of thin walls, where no rays tell that the wall is gone.
+    """How broken ends of thin walls are found, where no rays tell that the wall is gone.
 
     Attributes
     ----------
     stray_sigmas
-        So much of a point's noise below the surface noise alone leaves one point in 700.
+        A point may be part of an end if it lies this many standard deviations of its noise below
+        the surface; noise alone leaves one point in 700 there.
     thin_depths
-        A wall no thicker than so many times a point's depth: the point lies in its middle half.
+        A wall counts as thin if it is no thicker than this many times the point's depth, so that
+        the point lies in its middle half.
     """
 
     stray_sigmas: float = 3.0
@@ -119,68 +127,68 @@ class WallEndOptions:
 
 @dataclass(frozen=True, slots=True)
 class RegionOptions:
-    """Settings of the test for regions; a result records those it was made with.
+    """Settings of detection; a result records those it was made with.
 
     Attributes
     ----------
     false_regions
-        Expected number of regions that a scan of a sound part shows: the promise of the test,
-        shared out over scales, signs and places.
+        The expected number of false regions on a scan of a sound part. This is what the test
+        promises; it is shared out over scales, signs and places.
     tolerance_mm
-        δ, by how much a sound part may depart anywhere; None adds up the three that follow and
-        the template's own bias.
+        δ, by how much a sound part may deviate anywhere. None combines `allowance_mm`,
+        `registration_sigma_mm` and the template's own bias.
     allowance_mm
-        What the process may leave. Half a 0.2 mm layer: what section-at-mid-layer leaves on slopes
-        and rounds off at tops.
+        How far off the template the process may leave a surface. Half a 0.2 mm layer: so much
+        slicing at mid-layer leaves on slopes, and rounds off at tops.
     top_allowance_mm
-        The same under the plane of the layer just printed, which lies where the job's G-code puts
-        it: a quarter of a layer is left to the beads.
+        The same under the plane of the layer just printed. That plane lies where the G-code puts
+        it, so only a quarter of a layer is left to the beads.
     registration_sigma_mm
-        Standard deviation of the alignment at the surface.
+        Standard deviation of the alignment, at the surface.
     process_sigma_mm
-        By how much sound parts of this process depart from the template as a whole, as a profile
-        or a calibration knows it; 0 where nobody does: then all of it is taken for the scanner's.
+        By how much the surface of sound parts of this process wanders, as a profile or a
+        calibration knows it. With 0 all wander counts as the scanner's.
     widest_mm
-        Windows of local means reach up to this width: correlated errors of desktop and laser
-        scanners hang together over 2 to 10 mm, so that wider means gain nothing.
+        The widest windows of local means. Errors of desktop and laser scanners are correlated over
+        2 to 10 mm, so that wider means gain nothing.
     correlation_mm
-        Errors hang together over about so far, where what belongs to the whole part is fitted.
+        Over which length errors are taken to be correlated, where pose, scale and bow are fitted.
     far_mm
-        Windows between half of this and this far apart tell by how much errors wander: twice the
-        length over which they hang together.
+        The wander of errors is estimated from windows between half of this and this far apart:
+        twice the length over which errors are correlated.
     most_wander
-        Local means of well seen places wander by at most so many times the noise of one point: on
-        the ten views of a real object 0.3 to 0.5 times, merged 0.1.
+        The largest wander that is believed, in standard deviations of a single point. The ten views
+        of a real object show 0.3 to 0.5, merged 0.1.
     tail_from
-        Standard errors beyond the tolerance from which on exceedances tell the tail.
+        The tail of the errors is fitted to peaks this many standard errors beyond the tolerance.
     longest_tail
-        Standard errors over which exceedances of sound places fall to 1/e, at most: on twelve real
-        range scans 0.2 to 1.5. A calibration takes what lies far off to spread so far before it
-        has seen any.
+        The longest tail that is believed: in standard errors, over which peaks of sound places fall
+        to 1/e. Twelve real range scans show 0.2 to 1.5. A calibration that has seen no outlier
+        takes this spread for them.
     one_sided
-        So many times as many outlying cells a scanner's errors leave on one side of the template
-        as on the other, at most: in eleven real scans up to twice.
-    grow_share
-        A region goes on to where the mean deviation is this share of the tolerance.
-    grow_sigmas
-        … and beyond the noise by so many standard errors: 95 % of noise stays below.
+        How many times as many outliers errors may leave on one side of the template as on the
+        other. In eleven real scans it is up to twice.
+    grow_share, grow_sigmas
+        A region grows to where the deviation is below `grow_share` of the tolerance plus
+        `grow_sigmas` standard errors; 95 % of noise stays below the latter.
     seen_step
-        Classes of how densely and how squarely a place was seen, in octaves: aslant and at its
-        edges a scanner sees fewer points an area, and worse ones.
+        Width, in octaves, of the classes of how densely and how squarely a place was seen. Aslant
+        and at edges a scanner sees fewer and worse points.
     least_cells
-        Cells from which the noise of a class is told; with fewer it is that of the class below.
-        A scan with fewer in all cannot tell its noise: the profile's is used, and named.
+        How many cells a class needs for its noise to be estimated; with fewer it takes that of the
+        class before it. A scan with fewer in all cannot tell its noise: then the profile's is used,
+        and named.
     most_windows, bed_windows
-        So many windows tell by how much means wander: enough for a few per cent; of the bed, for a
+        How many windows the wander is estimated from: enough for a few per cent; on the bed, for a
         tenth.
     spacing_mm
-        Template surface points are asked for so far apart.
+        Distance between points on the template's surface.
     guess_depths
-        Behind surface that stands, as thick as a part may be there, a place is nobody's knowledge
-        where a template's guess lies within so many times its depth.
+        A cell behind surface that stands is not judged if a place where the template was guessed
+        lies within this many times the cell's depth.
     wall_ends, background, surfels, evidence
-        Where thin walls broke off, what is not the part, how the scan is condensed, and how space
-        around broken surface is known.
+        Options for the ends of thin walls, for what is not the part, for condensing the scan, and
+        for the space around broken surface.
     top_k
         How many of the highest scores make the object score (PASDF: 1000).
     """

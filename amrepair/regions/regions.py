@@ -15,7 +15,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.field.groups import area_per_point, group_points, touching_mm
 from amrepair.frames import box_of
 from amrepair.regions.anomaly import DefectType, Label, Region
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.significance import Level
 from amrepair.template.port import Template
@@ -26,20 +26,25 @@ MIN_AREA_MM2 = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Tested:
-    """What the test says of a scan.
+    """The result of the test on one scan.
 
     Attributes
     ----------
+    levels, noise
+        What was tested at each scale, and the scan's errors in a summary.
     calibration
-        What it was judged by: None, by the scan's own errors.
+        The calibration that was used; None where the scan's own errors were.
     missing, excess
         (s,) cells of scanned surface that belong to a region.
     gone, gone_p_value
-        (m,) template surface that rays went through and that belongs to one, and how sure it is.
+        (m,) template points that rays went through and that belong to a region, and the expected
+        number of false regions as significant.
     log_p
-        (2, b) logarithm of how many false regions are expected that are as sure, by side and site.
+        (2, b) logarithm of the expected number of false regions as significant, for missing and
+        for excess, at each inspected place.
     limit_mm, top_mm
-        The depth that half of the places would show over a few cells; under a layer's top.
+        The depth at which half of the places would be significant over a few cells; and the same
+        under the top of the layer just printed.
     """
 
     levels: tuple[Level, ...]
@@ -57,7 +62,7 @@ class Tested:
 def find_regions(
     evidence: Evidence, test: Tested, surface_mm: Points, surface_label: Numbers, template: Template
 ) -> tuple[Region, ...]:
-    """Regions of both kinds, largest first."""
+    """Group labelled cells and template points to regions, the largest first."""
     s = evidence.surfels
     labelled = surface_label == int(Label.MISSING)
     gone, gone_p = surface_mm[labelled], test.gone_p_value[labelled]
@@ -90,7 +95,7 @@ def _region(
     cell_mm: float,
     template: Template,
 ) -> Region:
-    """Size and type of one group."""
+    """Measure one group, and classify it."""
     box = box_of(points_mm)
     depth = float(np.abs(deviation_mm).max()) if len(deviation_mm) else float(np.ptp(box, 0).min())
     area = max(len(deviation_mm), 1) * cell_mm**2
@@ -105,7 +110,7 @@ def classify(
     box_mm: Float[np.ndarray, "2 3"],
     template: Template,
 ) -> DefectType:
-    """Type from geometry: shallow and wide, at the rim, or within."""
+    """The type of a defect by its geometry: shallow and wide, at the part's rim, or within."""
     if label is Label.EXCESS:
         return DefectType.BLOB
     if depth_mm < 0.05 * np.sqrt(area_mm2):

@@ -1,14 +1,18 @@
-"""The test: where robust local means lie beyond the tolerance by more than this scan's errors.
+"""The test: where local means lie beyond the tolerance by more than this scan's errors explain.
 
-The null is a minimum-effect one, |mean deviation| ≤ δ (Murphy and Myors 1999): δ is what a sound
-part may depart by, so that noise alone hardly matters. Means over several scales are tested; the
-stated number of false regions is shared out over scales, signs and windows. The standard error of
-a mean comes from the scan itself: what neighbouring cells differ by, and by how much windows that
-were seen as well depart as a whole, less what the process is known to leave. As few places as lie
-farther apart than errors hang together tell the latter: what is standardised by it is distributed
-as Student's t, not as a normal value. Where more places
-exceed the tolerance than can be real, their peaks tell the tail of the null (Efron 2004, by peaks
-over a threshold), but for those that stand out of it.
+What is tested is a minimum effect, |mean deviation| ≤ δ (Murphy and Myors 1999): δ is what a sound
+part may deviate by. Means over windows of several widths (scales) are tested, and the stated number
+of false regions is shared out over scales, signs and windows.
+
+The standard error of a mean comes from the scan itself and has two parts. One is independent from
+cell to cell, and neighbouring cells tell it by their differences. The other is common to a whole
+window, the wander, and windows far apart tell it by theirs, less what the process is known to
+leave. Only few places are so far apart that their errors are independent, so a deviation divided by
+this standard error is distributed as Student's t rather than normally.
+
+Real scanners leave more outliers than that. Where more places exceed the tolerance than can be
+real, their peaks tell the tail of the errors (Efron 2004, by peaks over a threshold); what stands
+out even from that tail is a defect.
 """
 
 from __future__ import annotations
@@ -25,9 +29,9 @@ from amrepair.field import scales_kernels
 from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.frames import cells_of
-from amrepair.regions.calibration import Calibration
+from amrepair.regions.error_calibration import Calibration
+from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import Sites
 
 # A quarter of the differences of two standard normal values are smaller: √2 Φ⁻¹(5/8).
 PAIR_QUARTILE = float(np.sqrt(2.0) * ndtri(0.625))
@@ -48,18 +52,19 @@ PAIRS_EFFICIENCY = 0.82
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """How the standardised exceedances of sound places fall off.
+    """How the peaks of sound places beyond the tolerance fall off, in standard errors.
 
     Attributes
     ----------
     start, scale
-        Beyond `start` peaks are exponential with mean `scale`; 0: as normal noise.
+        Beyond `start` the peaks are exponentially distributed with mean `scale`. A scale of 0 says
+        that there is no tail beyond that of normal noise.
     peaks
         How many such peaks a scan has.
     told_by
-        How many peaks told the scale: the fewer, the less sure it is.
+        How many peaks the scale was estimated from; the fewer, the less certain it is.
     longest
-        They fall to 1/e over so many standard errors at most, however few told the scale.
+        The longest scale that is believed, however few peaks it was estimated from.
     """
 
     start: float
@@ -69,9 +74,10 @@ class Tail:
     longest: float = np.inf
 
     def log_expected(self, z: Values) -> Values:
-        """(s,) logarithm of how many peaks of sound places a scan has beyond each value.
+        """(s,) logarithm of how many peaks of sound places are expected beyond each value.
 
-        An exponential whose mean is itself told by `told_by` peaks predicts a Lomax tail.
+        Where the mean of an exponential is itself estimated from `told_by` peaks, the predicted
+        tail is a Lomax distribution.
         """
         beyond = np.maximum(z - self.start, 0.0)
         falls = np.maximum(
@@ -80,7 +86,7 @@ class Tail:
         return np.asarray(np.log(self.peaks) - falls)
 
     def exceeded_by(self, expected: float) -> float:
-        """Beyond which value a scan has so many peaks of sound places."""
+        """The value beyond which so many peaks of sound places are expected in a scan."""
         ratio = max(self.peaks / expected, 1.0)
         told = self.told_by * self.scale * (ratio ** (1.0 / self.told_by) - 1.0)
         return self.start + min(told, self.longest * float(np.log(ratio)))
@@ -88,22 +94,21 @@ class Tail:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Standard errors of a scale.
+    """Standard errors at one scale.
 
     Attributes
     ----------
     cell_mm, window_mm
-        (s,) of a cell's value and of a window's median, by what neighbours differ by.
+        (s,) independent part of the standard error of a cell's value, and of a window's median.
     common_mm
-        (s,) what a window's cells have in common.
-    wander_mm
-        (c,) standard deviation of window means, by how well they were seen.
-    freedom
-        (c,) its degrees of freedom.
+        (s,) part of the standard error that all cells of a window share.
+    wander_mm, freedom
+        (c,) standard deviation of window means, for each class of how well windows were seen, and
+        the degrees of freedom of its estimate.
     group
-        (s,) class of how well each window was seen.
+        (s,) the class of each window; 0 was seen best.
     facing
-        Cosine of incidence of all but a few windows, at least.
+        All but a few windows were seen at a cosine of incidence of at least this.
     """
 
     cell_mm: Values
@@ -116,20 +121,20 @@ class Errors:
 
     @property
     def independent(self) -> float:
-        """How many of `RANK` cells of a window err by themselves: all do, or (1) all together.
+        """How many of `RANK` cells of a window err independently: from 1 (all together) to `RANK`.
 
-        Of independent errors a window's median has what its cells' differences tell; what it
-        departs by more, its cells have in common.
+        If all errors were independent, a window's median would err by no more than the differences
+        of its cells explain. What it errs by beyond that, its cells have in common.
         """
         whole = np.hypot(self.window_mm, self.common_mm)
         ratio = float(np.median(self.window_mm)) / float(np.median(whole))
         return 1.0 + (RANK - 1) * ratio**2
 
     def freedom_of(self, error_mm: Values) -> Values:
-        """(s,) degrees of freedom of a standard error that holds what windows have in common.
+        """(s,) degrees of freedom of standard errors that contain the wander.
 
-        Of its variances that of the wander alone is uncertain (Satterthwaite 1946); where it adds
-        nothing to what neighbours differ by, none is.
+        Only the variance of the wander is uncertain (Satterthwaite 1946). Where the wander adds
+        nothing to the independent part, the standard error counts as known: infinite.
         """
         wander = np.where(self.common_mm > 0.0, self.wander_mm[self.group], 0.0)
         share = np.minimum(wander / error_mm, 1.0) ** 4
@@ -139,29 +144,30 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One statistic at one scale, and what is significant of it.
+    """One statistic, tested at one scale. In pairs, missing comes first, then excess.
 
     Attributes
     ----------
     scale, errors
         The scale, and its standard errors.
     tolerance_mm, error_mm
-        (2, s) δ for missing and excess, and (s,) the standard error of the statistic.
+        (2, s) δ, and (s,) the standard error of the statistic.
     freedom
         (s,) degrees of freedom of the standard error.
     beyond_mm, z
-        (2, s) how far beyond the tolerance, missing, excess: the normal value as rare as so many
-        standard errors are with so few degrees of freedom.
+        (2, s) how far each window lies beyond the tolerance; and the same in standard errors, as
+        the normal value that is as rare as this value of Student's t.
     critical
-        (2,) from which on they are significant.
+        (2,) a window is significant if its z is above this,
     far_off_mm
-        (2,) how far beyond the tolerance they must lie for that, too, as sound places may seem to.
+        (2,) and if it also lies beyond the tolerance by more than this, since sound places may
+        seem to where the scanner errs most.
     quantile
-        From which on they would be if errors were normal.
+        What `critical` would be if errors were normal.
     log_p
-        (2, s) natural logarithm of the expected number of false regions as high or higher.
+        (2, s) natural logarithm of the expected number of false regions at least as high.
     peaks
-        For missing and excess: the highest of each group of windows that stand out.
+        The highest z of each group of windows beyond the tolerance.
     """
 
     scale: Scale
@@ -181,18 +187,18 @@ class Level:
     def rejected(self) -> Bool[np.ndarray, "2 s"]:
         """(2, s) windows whose deviation is significant."""
         far = self.beyond_mm > self.far_off_mm[:, None]
-        # a wall's end lies deep or is none: what sound places stray by tells nothing of it
+        # how sound places stray says nothing of a wall's end, which lies deep or is none
         critical = np.where(self.scale.apart, self.quantile, self.critical[:, None])
         return np.asarray(far & (self.z > critical))
 
     @property
     def chance_mm(self) -> Values:
-        """(s,) how far beyond what is allowed a sound place may seem to lie, missing."""
+        """(s,) how far beyond the tolerance a sound place may seem to be missing, by chance."""
         by_noise_mm = as_student(self.critical[0], self.freedom) * self.error_mm
         return np.maximum(by_noise_mm, self.far_off_mm[0])
 
     def far_mm(self, start: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]:
-        """(p,), (q,) how far beyond the tolerance groups of windows lie that stand out so far."""
+        """(p,), (q,) how far beyond the tolerance groups of windows with z above `start` lie."""
         low, high = (
             _peaks(self.scale, z > start, beyond_mm)
             for z, beyond_mm in zip(self.z, self.beyond_mm, strict=True)
@@ -201,12 +207,12 @@ class Level:
 
     @property
     def smallest_mm(self) -> float:
-        """The deviation that half of the places would show as significant."""
+        """The deviation that would be significant at half of the places."""
         return float(np.median(self.tolerance_mm[0] + self.chance_mm))
 
 
 def as_normal(t: Float[np.ndarray, "*n"], freedom: Values) -> Any:
-    """(*n,) the normal values as rare as Student's t of so many degrees of freedom, the last axis.
+    """(*n,) normal values as rare as values of Student's t; `freedom` runs along the last axis.
 
     References
     ----------
@@ -220,7 +226,7 @@ def as_normal(t: Float[np.ndarray, "*n"], freedom: Values) -> Any:
 
 
 def as_student(z: float, freedom: Values) -> Values:
-    """(s,) the inverse of `as_normal`; as far as a float goes."""
+    """(s,) the inverse of `as_normal`, at most `MOST_ERRORS`."""
     some = np.isfinite(freedom) & np.isfinite(z)
     few = np.where(some, freedom, 1.0)
     length = (8.0 * few + 3.0) / (8.0 * few + 1.0) * (z if np.isfinite(z) else 0.0)
@@ -229,17 +235,21 @@ def as_student(z: float, freedom: Values) -> Values:
 
 
 def tested(
-    sites: Sites, options: RegionOptions, calibration: Calibration | None
+    inspected: Inspected, options: RegionOptions, calibration: Calibration | None
 ) -> tuple[Level, ...]:
-    """Test every scale's medians, and the third deepest and highest cells of the first."""
+    """Test the medians of windows at every scale, and small groups of cells at the first.
+
+    At the first scale the statistic is the third lowest and third highest cell of a window, so that
+    three deviating cells suffice. This level comes first in the result.
+    """
     scales = scales_of(
-        sites.place_mm,
-        sites.normal,
-        sites.value_mm,
-        sites.weight,
-        cell_mm=sites.cell_mm,
+        inspected.place_mm,
+        inspected.normal,
+        inspected.value_mm,
+        inspected.weight,
+        cell_mm=inspected.cell_mm,
         widest_mm=options.widest_mm,
-        apart=sites.apart,
+        apart=inspected.apart,
     )
     share = options.false_regions / (2 * (len(scales) + 1))
     levels = []
@@ -247,7 +257,7 @@ def tested(
         size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
         cells = (
             np.bincount(scale.of_base, told, len(scale)) / size
-            for told in (*sites.tolerance_mm, sites.facing, sites.pose_mm)
+            for told in (*inspected.tolerance_mm, inspected.facing, inspected.pose_mm)
         )
         *delta, faced, pose = (
             scales_kernels.window_means(scale.table, scale.count, told) for told in cells
@@ -267,7 +277,7 @@ def tested(
 
 
 def point_sigma_mm(first: Scale) -> float:
-    """Standard deviation of one point about its neighbours, from the field's own cells."""
+    """Standard deviation of a single point about its neighbours, from the first scale's cells."""
     return float(np.median(first.noise_mm) * np.sqrt(max(float(np.median(first.weight)), 1.0)))
 
 
@@ -280,9 +290,9 @@ def _errors(
     calibration: Calibration | None,
     most_mm: float,
 ) -> Errors:
-    """What neighbouring cells differ by, and by how much, at most, whole windows wander."""
+    """The standard errors of a scale: independent from cell to cell, and common to windows."""
     classes = int(group.max()) + 1
-    # what few neighbours tell by chance to be quiet is as noisy as places seen as well
+    # a cell whose few neighbours happen to agree is as noisy as others that were seen as well
     usual = by_class(group, scale.noise_mm, options)[group]
     cell = np.maximum(np.maximum(scale.noise_mm, usual), LEAST_SIGMA_MM)
     window = MEDIAN_LOSS * cell / np.sqrt(scale.count)
@@ -290,7 +300,7 @@ def _errors(
         wander, freedom = _wander(scale, group, classes, options, most_mm)
     else:
         wander, freedom = calibration.wander(scale.width_mm, classes)
-    # nothing that was seen so far aslant has told
+    # the calibration has seen nothing so far aslant: there errors grow
     aslant = 1.0 if calibration is None else np.maximum(calibration.facing / facing, 1.0)
     explained = options.process_sigma_mm**2 + window**2
     common = np.sqrt(np.maximum((wander[group] * aslant) ** 2 - explained, 0.0) + pose_mm**2)
@@ -300,10 +310,11 @@ def _errors(
 
 
 def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:
-    """(s,) how well each window was seen: octaves over `step` below the better half, which is 0.
+    """(s,) class of how well each window was seen; 0 is the better half.
 
-    By how many points saw it or how squarely, whichever is the worse: aslant, at edges and at the
-    border of what was seen a scanner errs more, and as a whole.
+    By the number of points or by the cosine of incidence, whichever is worse relative to the
+    median, in steps of `step` octaves. A scanner errs more where it looks aslant, at edges, and at
+    the border of what it saw.
     """
     relative = np.minimum(
         scale.window_weight / float(np.median(scale.window_weight)),
@@ -320,10 +331,11 @@ def by_class(
     share: float = 0.5,
     classes: int | None = None,
 ) -> Float[np.ndarray, " c"]:
-    """(c,) of a value in each class, what a share of them is below: the median, unless said.
+    """(c,) the median, or another quantile, of a value in each class of windows.
 
-    Never less in one that was seen less well, nor more by a larger factor than the square of how
-    much less: at an angle θ of incidence errors of real views grow with 1/cos θ to 1/cos² θ.
+    Made to rise from class to class, since errors do not shrink where a place was seen less well;
+    but by no more than the square of how much less well, since at an angle of incidence θ errors of
+    real scans grow with 1/cos θ to 1/cos² θ.
     """
     size = np.bincount(group, minlength=classes or 0)
     found = np.zeros(len(size))
@@ -337,26 +349,28 @@ def by_class(
 def _wander(
     scale: Scale, group: Int[np.ndarray, " s"], classes: int, options: RegionOptions, most_mm: float
 ) -> tuple[Values, Values]:
-    """(c,) standard deviation of window means about what is normal some way off, by class.
+    """(c,) the wander, that is the standard deviation of window means, and its degrees of freedom.
 
-    And (c,) its degrees of freedom. From the differences of windows that face the same way, farther
-    apart than errors hang together: a layer that lacks as a whole is no error. By how well the
-    worse one was seen.
+    Estimated from differences between windows that face the same way and lie farther apart than
+    errors are correlated. A pair belongs to the class of its worse seen window. Only windows that
+    face the same way are paired: where a whole layer is too low, all of them are, and this must not
+    count as an error.
     """
     own = ~scale.apart  # how deep a wall's end lies tells nothing of errors
     place_mm, normal = scale.place_mm[own], scale.normal[own]
     pick = np.arange(0, len(place_mm), max(len(place_mm) // options.most_windows, 1))
-    # places farther apart than errors reach: so many tell of them on their own
+    # patches farther apart than errors are correlated: their number is that of independent places
     cell = cells_of(place_mm, 0.0, 0.5 * options.far_mm)
     patch_of = cell_numbers(np.column_stack([cell, ways_of(normal)]))
-    # a defect on a third of what was seen best is in half of the pairs there: not in three quarters
+    # a defect on a third of the best seen places is in half of all pairs, so the median would see
+    # it; the lower quartile does not
     off_mm, worse, touched = scales_kernels.differences_apart(
         place_mm, normal, scale.median_mm[own], group[own], patch_of, pick,
         0.5 * options.far_mm, options.far_mm, WINDOW_FACING, classes,
     )  # fmt: skip
     off_mm /= PAIR_QUARTILE
     found = by_class(worse, off_mm, options, share=0.25, classes=classes)
-    # a bent part wanders too, but no scanner does so smoothly and so far
+    # a bent part wanders too, smoothly and farther than any scanner does
     found *= min(1.0, most_mm / max(float(found[0]), LEAST_SIGMA_MM))
     pairs = np.bincount(worse, minlength=classes)
     return found, _freedom(pairs, touched.sum(axis=1), options)
@@ -365,9 +379,9 @@ def _wander(
 def _freedom(
     pairs: Int[np.ndarray, " c"], places: Int[np.ndarray, " c"], options: RegionOptions
 ) -> Float[np.ndarray, " c"]:
-    """(c,) degrees of freedom of each class's wander, by its pairs and the places that they join.
+    """(c,) degrees of freedom of each class's wander, from how many places its pairs join.
 
-    A class too small to be told has those of the one whose value it took.
+    A class with too few pairs has those of the class whose value it takes.
     """
     freedom = np.empty(len(pairs))
     last = 1.0
@@ -388,7 +402,11 @@ def _level(
     calibration: Calibration | None,
     statistic: int,
 ) -> Level:
-    """Standardise one statistic, and say from which value on it is significant."""
+    """Standardise one statistic, and find from which value on it is significant.
+
+    `statistic` is 0 for the third lowest and highest cells, 1 for medians; `share` is the number of
+    false regions that this level may cause on one side.
+    """
     own_mm, together = (
         (errors.cell_mm, errors.independent) if statistic == 0 else (errors.window_mm, 1.0)
     )
@@ -399,14 +417,14 @@ def _level(
     alone = ~scale.is_surface
     z[:, alone] = -np.inf
     n = max(int((~alone).sum()), 1)
-    # `together` of a window's cells are all as far out: Q^r in any of C(k, r) choices
+    # the chance that r = `together` of the k cells of a window are all so far out: C(k, r) · Q^r
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
     quantile = -float(ndtri(min((share / (n * ways)) ** (1.0 / together), 0.5)))
     critical = np.full(2, quantile)
     if statistic == 0 and calibration is None:
         outlying = _outlying(scale, error_mm, tolerance_mm, options.one_sided)
-        # so many outlying cells fall together by chance
+        # with so many outlying cells, three of them meet in a window by chance
         critical[n * comb(usual, RANK) * outlying**RANK > share] = np.inf
     safe = np.clip(z, 0.0, MOST_ERRORS)
     log_p = np.log(n * ways) + together * log_ndtr(-safe)
@@ -431,12 +449,13 @@ def _level(
 def _outlying(
     scale: Scale, error_mm: Values, tolerance_mm: Float[np.ndarray, "2 s"], one_sided: float
 ) -> Float[np.ndarray, " 2"]:
-    """(2,) what share of the cells are outliers by a scanner's errors, for missing and for excess.
+    """(2,) the share of cells that are outliers by the scanner's errors, for missing and excess.
 
-    Errors are all over a scan, a defect is at one place: counted among them, its own cells would be
-    told as errors; those that hang together in the largest place are not. A defect lies to one
-    side, errors to both: on a side there are at most `one_sided` times as many of them as the other
-    tells. (Of a count of k, k + 1 is the mean that a uniform prior leaves.)
+    A defect's own cells are outliers too and must not count as errors, which two rules prevent.
+    Errors lie all over a scan but a defect at one place, so the largest connected group is left
+    out. And errors lie on both sides of the template but a defect on one, so a side has at most
+    `one_sided` times as many errors as the other side shows. (For a count of k, the mean under a
+    uniform prior is k + 1.)
     """
     off_mm = scale.value_mm - scale.median_mm
     low, high = (
@@ -449,14 +468,14 @@ def _outlying(
 
 
 def _groups(scale: Scale, chosen: Mask) -> Numbers:
-    """(s,) number of the connected group that each chosen window belongs to."""
+    """(s,) the number of the connected group of chosen windows that each window belongs to."""
     window, cell = scale.cells_of(chosen)
     beside = chosen[cell]
     return connected(window[beside], cell[beside], len(chosen))
 
 
 def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
-    """(p,) the highest value of each connected group of windows that stand out, rising."""
+    """(p,) the highest value of each connected group of the windows in `over`, in rising order."""
     group = _groups(scale, over)
     peak = np.full(len(value), -np.inf)
     np.maximum.at(peak, group[over], value[over])
@@ -464,12 +483,12 @@ def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
 
 
 def _tail(peaks: Values, options: RegionOptions) -> Tail:
-    """The exponential tail of the peaks over the tolerance that belong together.
+    """Fit an exponential tail to those peaks over the tolerance that are errors.
 
-    What so many peaks with the longest tail do not reach is no error, and tells nothing of them.
-    The lower half of the rest is taken for errors; from there upwards each is, too, for as long
-    as it is no outlier of the exponential that those before it tell (a forward search, as in
-    Kimber 1982). The first outlier and all above it may be real.
+    Which peaks are errors is found by a forward search, as in Kimber 1982. Peaks that even the
+    longest tail would not reach are left out first. The lower half of the rest is taken for errors;
+    from there upwards each peak is added for as long as it is no outlier of the exponential fitted
+    to those below it. The first outlier and all above it may be real defects.
     """
     start, longest = options.tail_from, options.longest_tail
 

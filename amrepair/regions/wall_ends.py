@@ -1,11 +1,13 @@
-"""Broken ends of thin walls, where no rays tell that the wall is gone.
+"""Broken ends of thin walls, found by geometry where no rays tell that the wall is gone.
 
-Inside a wall no place lies deeper than half its thickness, and where a wall broke off the scan
-shows no more than its end: a strip as wide as the wall, whose distances to the template say little,
-while the walls' own faces beside it are sound. But a surface in the middle of a wall that faces
-along it is neither of its faces. How far it is from where the part's surface should be, in the
-direction that it faces, its distance to the nearest face does not tell. Points that stray into a
-wall lie across it, too, by chance: but there both faces go on on either side.
+Where a thin wall broke off, a scan without rays shows only the fracture: a strip as wide as the
+wall. Its points lie inside the wall, so at most half the wall's thickness from the template, and
+their deviations look harmless. But their orientation tells: a surface in the middle of a wall that
+faces along the wall is neither of the wall's faces. How much is missing is then measured in the
+direction that the fracture faces, not to the nearest face.
+
+Stray points inside a wall may by chance seem to lie across it, too. They are told from a fracture
+because both faces of the wall go on at either side of them.
 """
 
 from __future__ import annotations
@@ -30,16 +32,16 @@ MOST_STEPS = 16
 
 @dataclass(frozen=True)
 class ShownSurface:
-    """Places evenly spread on the template's surface.
+    """Points spread evenly over the template's surface, and which of them the scan shows.
 
     Attributes
     ----------
     place_mm, normal
-        (m, 3) places, and outward unit normals.
+        (m, 3) points, and outward unit normals.
     present
-        (m,) whether scanned surface lies on each.
+        (m,) whether scanned surface lies on each,
     present_mm
-        How near it has to lie for that.
+        which means no farther off than this.
     """
 
     place_mm: Points
@@ -52,25 +54,25 @@ class ShownSurface:
         return PlaceTree.of(self.place_mm)
 
     def nearest(self, points_mm: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """(n,) the place nearest to each point."""
+        """(n,) the surface point nearest to each of some points."""
         return self._tree.nearest_one(points_mm)
 
 
 @dataclass(frozen=True, slots=True)
 class WallEnds:
-    """Cells of points that lie across a wall, template frame.
+    """Broken ends, condensed to the cells of the scan, template frame.
 
     Attributes
     ----------
     place_mm, normal
-        (e, 3) mean places, and unit normals (either sign) of the wall's faces: in that direction it
-        matters how far a pose is off.
+        (e, 3) mean places; and unit normals of the wall's faces, with either sign: an error of the
+        pose matters in this direction.
     depth_mm
-        (e,) how far below the part's surface, in the direction that the end faces.
+        (e,) how far the end lies below the part's surface, in the direction that it faces.
     count
-        (e,) points in each.
+        (e,) the number of points of each.
     surfel
-        (e,) the cell of the field that they are part of.
+        (e,) the number of the cell that the points belong to.
     """
 
     place_mm: Points
@@ -94,16 +96,16 @@ def wall_ends(
     plane_points: int,
     options: WallEndOptions,
 ) -> WallEnds:
-    """Find points inside thin walls whose planes lie across them, and condense them to cells.
+    """Find points inside thin walls whose local planes lie across the wall, and condense them.
 
     Parameters
     ----------
     scan, surfels
         In the template's frame.
     surface
-        The template's, and what of it the scan shows.
+        The template's surface, and which of it the scan shows.
     plane_points
-        So many neighbours tell the plane at a point.
+        How many neighbours a point's local plane is fitted to.
     """
     points_mm, sigma_mm = scan.points_mm, max(scan.sigma_mm, surfels.spread_mm)
     inside = surfels.of_point >= 0
@@ -112,29 +114,29 @@ def wall_ends(
     deep_mm = -surfels.point_deviation_mm[which]
     face = surface.normal[surface.nearest(points_mm[which])]
     most_mm = options.thin_depths * deep_mm
-    through_mm = _way_out(template, points_mm[which], face, most_mm)
-    through_mm += _way_out(template, points_mm[which], -face, most_mm)
+    through_mm = _distance_along(template, points_mm[which], face, most_mm)
+    through_mm += _distance_along(template, points_mm[which], -face, most_mm)
     thin = through_mm < most_mm
     if not thin.any():
         return NO_ENDS
     which, face, through_mm = which[thin], face[thin], through_mm[thin]
-    plane = _planes(points_mm, which, surfels, plane_points)
+    plane = _local_planes(points_mm, which, surfels, plane_points)
     across = np.abs((plane * face).sum(axis=1)) < WINDOW_FACING
     which, face, plane, through_mm = (told[across] for told in (which, face, plane, through_mm))
-    ends = _goes_no_further(surface, points_mm[which], 0.5 * through_mm[:, None] * face, plane)
+    ends = _faces_end_here(surface, points_mm[which], 0.5 * through_mm[:, None] * face, plane)
     which, face, plane, through_mm = (told[ends] for told in (which, face, plane, through_mm))
-    # of a bare cloud's plane nobody knows which way it faces
+    # a cloud without normals does not say which way a plane faces, so the nearer surface counts
     depth_mm = np.minimum(
-        _way_out(template, points_mm[which], plane, through_mm),
-        _way_out(template, points_mm[which], -plane, through_mm),
+        _distance_along(template, points_mm[which], plane, through_mm),
+        _distance_along(template, points_mm[which], -plane, through_mm),
     )
     return _condensed(points_mm[which], face, depth_mm, surfels.of_point[which])
 
 
-def _goes_no_further(
+def _faces_end_here(
     surface: ShownSurface, points_mm: Points, to_face_mm: Points, plane: Points
 ) -> Bool[np.ndarray, " n"]:
-    """(n,) whether on one side of a plane across a wall neither of the wall's faces was seen."""
+    """(n,) whether, on one side of a plane across a wall, the scan shows neither of its faces."""
     beyond_mm = 2.0 * surface.present_mm * plane  # what lies at the end itself is not there
     gone = [
         ~surface.present[surface.nearest(points_mm + way * beyond_mm + side * to_face_mm)]
@@ -144,10 +146,10 @@ def _goes_no_further(
     return (gone[0] & gone[1]) | (gone[2] & gone[3])
 
 
-def _way_out(
+def _distance_along(
     template: Template, points_mm: Points, way: Points, most_mm: Values
 ) -> Float[np.ndarray, " n"]:
-    """(n,) how far from points inside the template its surface is along a direction, or `most_mm`.
+    """(n,) distance from points inside the template to its surface along a direction, or `most_mm`.
 
     Sphere tracing (Hart 1996).
     """
@@ -161,7 +163,7 @@ def _way_out(
     return np.maximum(far_mm, 0.0)
 
 
-def _planes(
+def _local_planes(
     points_mm: Float[np.ndarray, "p 3"], which: Numbers, surfels: Surfels, count: int
 ) -> Points:
     """(n, 3) normals of the planes through some points and their neighbours."""
@@ -177,14 +179,14 @@ def _planes(
 
 
 def _condensed(points_mm: Points, face: Points, depth_mm: Values, surfel: Numbers) -> WallEnds:
-    """What points say, by the cell of the field that they lie in."""
+    """Average over the points of each cell."""
     cells, of_point = np.unique(surfel, return_inverse=True)
     count = np.bincount(of_point).astype(np.float64)
 
     def mean(value: Values) -> Float[np.ndarray, " c"]:
         return np.asarray(np.bincount(of_point, value, len(cells)) / count)
 
-    # some points are nearer to one face and some to the other: all of a cell are turned to one side
+    # points of a cell may lie nearer to one face or the other: turn all to the same face
     side = (face * face[np.unique(of_point, return_index=True)[1]][of_point]).sum(axis=1)
     turned = face * np.where(side < 0.0, -1.0, 1.0)[:, None]
     normal = np.stack([mean(part) for part in turned.T], axis=1)

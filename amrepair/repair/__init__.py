@@ -1,7 +1,8 @@
 """Repair: from one scan to a checked program that fills what is missing.
 
-`pipeline.plan_repair` is the whole offline algorithm, a call per stage. It moves nothing and writes
-no file: the loop sends what it makes, the command line writes it.
+Begin reading at `pipeline.plan_repair`: it is the whole offline algorithm, with one call for each
+stage. It moves no machine and writes no file; the loop sends the program, and the command line
+writes it.
 """
 
 from amrepair.repair.pipeline import plan_repair

@@ -1,4 +1,4 @@
-"""Which pieces of a deficit are filled, and what a repair of them rests on."""
+"""Which pieces of a deficit a repair fills, and the job's lines that it may follow."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from amrepair.deficit import Deficit
 from amrepair.frames import Transform, nearest_box
-from amrepair.policy import PolicyOptions, worth
+from amrepair.policy import PolicyOptions, acceptance
 from amrepair.regions import Label, Region
 from amrepair.repair.site import Site
 from gcode.meshes import box_of_solid
@@ -20,17 +20,17 @@ from gcode.slicing.job_lines import JobLines
 def fillable(
     deficit: Deficit, wanted: Callable[[Region], bool], policy: PolicyOptions
 ) -> manifold3d.Manifold:
-    """The missing pieces that are worth a repair, and wanted in it."""
+    """One solid of all missing pieces that are worth a repair and that the caller wants filled."""
     pieces = deficit.missing.decompose()
     boxes = [box_of_solid(piece) for piece in pieces]
     regions = [region for region in deficit.regions if region.label is Label.MISSING]
     known = [region.box_mm for region in regions]
     of_piece = [regions[nearest_box(known, box)] if regions else None for box in boxes]
     weighed = [
-        worth.Piece(box, piece.volume(), skipped=region is not None and region.skipped)
+        acceptance.Piece(box, piece.volume(), skipped=region is not None and region.skipped)
         for box, piece, region in zip(boxes, pieces, of_piece, strict=True)
     ]
-    keep = worth.worth_mending(weighed, policy)
+    keep = acceptance.worth_mending(weighed, policy)
     filled = [
         piece
         for piece, region, kept in zip(pieces, of_piece, keep, strict=True)
@@ -42,7 +42,7 @@ def fillable(
 
 
 def lines_of(site: Site, deficit: Deficit, placed: Transform) -> JobLines | None:
-    """The job's lines, and which stretches of them the deficit says are gone, build frame."""
+    """The job's lines, build frame, marked with the stretches that the deficit found missing."""
     if site.lines is None or deficit.gone is None:
         return site.lines
     ends = [placed.apply(ends_mm) for ends_mm in (deficit.gone.start_mm, deficit.gone.end_mm)]

@@ -1,4 +1,4 @@
-"""The numbers of a repair that no profile and no measurement gives."""
+"""The numbers of a repair that come from no profile and no measurement."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ from gcode.slicing.options import PatchOptions
 
 @dataclass(frozen=True, slots=True)
 class RepairOptions:
-    """What of a scan is held against the template, and when two repairs are the same.
+    """Which points of a scan are judged, when two repairs are the same, and each stage's options.
 
     Attributes
     ----------
     planned_edge_mm
-        A planned template ends below; so near to its end its distances are not to be trusted.
+        A planned template of the last layers ends below in mid-air. Up to this far from that end
+        its distances are not trusted.
     off_the_part_mm, over_beside_mm, on_bed_mm
-        What lies beside the part: so far off it, no higher than it was to be by this much, and
-        higher than what is taken for the bed.
+        A point lies on skirt, brim or supports if it is at least `off_the_part_mm` off the part,
+        at most `over_beside_mm` above their planned height, and more than `on_bed_mm` above the
+        bed.
     stray_mm
-        Strands of supports spread and stray by so much; skirts and towers, too.
+        How far strands of supports, skirts and towers may stray from their planned place.
     just_printed_margin_mm
-        What is added, where nobody saw it, to the height that a job has just printed to: no sensor
-        sees into a deep cell of infill, or behind a wall, and the head has just been there.
+        Added to the height just printed, where nobody saw what stands: no sensor looks into a deep
+        cell of infill or behind a wall. 0, since the head has just been there.
     upright
-        A part stands upright where its Z is the bed's: 1 − cos of 0.05 mm over 100 mm.
+        A part is upright if its Z axis leaves the bed's by no more than this, as 1 − cosine:
+        0.05 mm over 100 mm.
     same_repair_ratio
-        Two poses whose repairs share less than this are two different repairs.
+        Two poses lead to the same repair if their missing volumes overlap by at least this ratio.
     damage_told_within_mm
-        A hand shows where on the bed a damage is no more exactly than this.
+        How exactly a person shows where on the bed a damage is.
     align, regions, deficit, patch
-        Of each stage. What the process may leave, and how far it wanders, is the site's.
+        Options of the stages. The site itself has the allowances of the process.
     """
 
     planned_edge_mm: float = 1.0
@@ -52,4 +55,4 @@ class RepairOptions:
 
 
 USUAL_REPAIR = RepairOptions()
-"""What the loop and the command line go by."""
+"""The default of the loop and the command line."""

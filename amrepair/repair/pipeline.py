@@ -1,4 +1,4 @@
-"""From a scan to a checked program, a call per stage."""
+"""The offline algorithm: from a scan to a checked program, with one call for each stage."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ from amrepair.frames import Transform, box_corners, box_of
 from amrepair.observe.rays import RangeImage, range_images
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.bed import by_beds, of_bed
-from amrepair.regions.calibration import NORMAL_NOISE, of_touches
+from amrepair.regions.error_calibration import NORMAL_NOISE, of_touches
+from amrepair.regions.inspected import tolerances
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import PoseKnown, tolerances
-from amrepair.repair import in_view
+from amrepair.regions.systematic import PoseKnown
+from amrepair.repair import scan_scope
 from amrepair.repair.filling import fillable, lines_of
+from amrepair.repair.path_offsets import off_by_job
 from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Finished, Site
 from amrepair.repair.stopwatch import Stopwatch
@@ -67,16 +69,25 @@ def plan_repair(
     Parameters
     ----------
     scan
-        In whatever frame its sensor has; in that of the printer's probe no pose is looked for.
+        In any frame. A scan in the frame of the printer's own probe needs no alignment.
+    site
+        What the scan is held against: template, printer, place on the bed, options.
+    title
+        The first line of the program.
     guess
-        A pose (template from the scan's frame) known beforehand; None searches from any pose.
+        A pose that is known beforehand, template from the scan's frame; None searches all poses.
     interruption
-        The state of the machine in mid-job; None makes a whole program for a standing part.
+        The machine's state, where a running job is interrupted for the repair; None makes a
+        program that stands alone, for a finished part.
     strict
-        Raise where the checker refuses the program; else return a plan without one, that says so:
-        a job must not die of a patch that is never sent.
+        Whether to raise where the checker refuses the program. If not, the plan comes back without
+        a program and says why: a running job must not die of a patch that is never sent.
     wanted
-        Which of the missing regions the program is to fill.
+        Says of each missing region whether the program is to fill it.
+    rng
+        For the search of a pose.
+    watch
+        Measures the time of each stage.
 
     Raises
     ------
@@ -131,19 +142,22 @@ def plan_repair(
 
 @dataclass(frozen=True, slots=True)
 class _Laid:
-    """A scan laid into its template.
+    """A scan that has been aligned to its template.
 
     Attributes
     ----------
+    registration
+        Template from scan.
     placed
         Build from template.
     whole, judged
-        The scan in the template's frame: all of it, and what is held against the template.
+        The scan in the template's frame: all of it, and only what is compared with the template.
     images
-        What rays saw, in the template's frame; None where what is expected ends in mid-air.
+        Its range images, in the template's frame; None where a planned template ends in mid-air.
     pose
-        How well it is known: told, as that of the printer's own probe; of a part that stands where
-        it was printed, in a scan in the printer's frame; or as the scan alone tells.
+        How well the pose is known: `told` by the printer's own probe; `stands` for a part that
+        stands where it was printed, scanned in the printer's frame; `free` where the scan alone
+        tells it.
     """
 
     registration: Registration
@@ -154,7 +168,7 @@ class _Laid:
     pose: PoseKnown
 
     def by(self, other: Registration) -> _Laid:
-        """The same scan in another pose of the part that it fits as well."""
+        """The same scan under another registration, of a symmetric part that fits in several."""
         motion = other.template_from_scan @ self.registration.template_from_scan.inverse()
         return replace(
             self,
@@ -165,7 +179,7 @@ class _Laid:
         )
 
     def plan(self, anomaly: AnomalyMap, deficit: Deficit, site: Site) -> RepairPlan:
-        """The verdict, as yet without a program."""
+        """The plan so far: what was found, without a patch or a program."""
         return RepairPlan(
             self.registration,
             anomaly,
@@ -185,22 +199,23 @@ def _align(
     rng: np.random.Generator | None,
     progress: Progress,
 ) -> _Laid:
-    """Lay the scan into the template; a pose in which a part cannot stand is refused."""
+    """Align the scan to the template, and refuse a pose in which the part cannot stand."""
     with ThreadPoolExecutor(1) as beside:
-        # what rays saw needs no pose, nor it them; a part of the scan has images of its own
-        seen = None if in_view.is_cut(site) else beside.submit(range_images, scan)
+        # range images and the pose do not need each other, so they are made side by side; where
+        # only the last layers are judged, the detector makes the images of that part of the scan
+        seen = None if scan_scope.ends_in_air(site) else beside.submit(range_images, scan)
         known = guess if scan.frame == PROBE else None
         if known is not None:
             registration = Registration.known(known)
         else:
             registration = align(
-                scan if guess is None else in_view.without_finished(scan, site, guess),
+                scan if guess is None else scan_scope.without_finished_objects(scan, site, guess),
                 site.template,
                 guess=guess,
                 part_is_known=site.part_is_known,
-                so_far=in_view.so_far(site),
-                aside=in_view.laid_aside(site),
-                options=in_view.aligning(site),
+                so_far=scan_scope.planned_so_far(site),
+                aside=scan_scope.beside_part(site),
+                options=scan_scope.align_options(site),
                 rng=rng,
                 progress=progress,
             )
@@ -211,21 +226,24 @@ def _align(
         refuse_impossible(site.template, placed, printer, said=said, raised=raised)
     moved = registration.template_from_scan
     whole = scan.moved(moved)
-    own = in_view.without_finished(whole, site, Transform.identity("template", "template"))
+    own = scan_scope.without_finished_objects(
+        whole, site, Transform.identity("template", "template")
+    )
     return _Laid(
         registration,
         placed,
         whole,
-        in_view.of_layer(in_view.of_the_part(own, site), site),
+        scan_scope.within_planned(scan_scope.without_beside(own, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
         "told" if known is not None else "stands" if scan.frame == "build" and said else "free",
     )
 
 
 def _by_the_bed(laid: _Laid, site: Site) -> Site:
-    """Where nobody has told of the scanner's errors, the bed that is scanned with a part does.
+    """The site with the scanner's errors as the bed beside the part shows them.
 
-    And what it showed in the looks before.
+    Only where no calibration is known, so that normal noise would be assumed. The bed in earlier
+    looks of the same run counts too.
     """
     if site.calibration != NORMAL_NOISE:
         return site
@@ -243,7 +261,7 @@ def _by_the_bed(laid: _Laid, site: Site) -> Site:
 def _judge(
     laid: _Laid, site: Site, watch: Stopwatch, progress: Progress
 ) -> tuple[AnomalyMap, Deficit]:
-    """Find the regions, and make solids of them."""
+    """Find the regions that deviate, and make solids of them."""
     with watch("detect"):
         anomaly = _detect(laid, site, progress)
     with watch("deficit"):
@@ -251,23 +269,23 @@ def _judge(
 
 
 def _detect(laid: _Laid, site: Site, progress: Progress) -> AnomalyMap:
-    """Hold the scan against what is expected."""
+    """Compare the scan with what is expected, and find the regions that deviate."""
     return site.detector(
         laid.judged,
         site.expected,
         options=_region_options(site),
         calibration=site.calibration,
-        top_z_mm=in_view.top_of_layer(site),
+        top_z_mm=scan_scope.layer_top_mm(site),
         images=laid.images,
         surface=site.surface,
         pose=laid.pose,
-        off_by_job=in_view.off_by_job(site, laid.placed),
+        off_by_job=off_by_job(site, laid.placed),
         progress=progress,
     )
 
 
 def _region_options(site: Site) -> RegionOptions:
-    """What regions are tested by here."""
+    """The options of the test, with the allowances of the site's process."""
     return replace(
         site.options.regions,
         allowance_mm=site.allowance_mm,
@@ -276,7 +294,7 @@ def _region_options(site: Site) -> RegionOptions:
 
 
 def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -> Deficit:
-    """Solids of what is missing and of what is too much, build frame."""
+    """Make solids of what is missing and of what is too much, build frame."""
     return compute_deficit(
         laid.judged,
         site.expected,
@@ -291,7 +309,10 @@ def _deficit(laid: _Laid, anomaly: AnomalyMap, site: Site, progress: Progress) -
 
 
 def _as_built(laid: _Laid, anomaly: AnomalyMap, site: Site) -> AsBuilt:
-    """What stands there is all that was seen, the bottoms of open cells too."""
+    """How the heights of what stands on the bed are made for a print with open infill.
+
+    The scan's own heights count everywhere there, down to the floors of open cells.
+    """
     evidence = anomaly.evidence
     assert evidence is not None
     spacing_mm, images, options = (
@@ -312,7 +333,7 @@ def _as_built(laid: _Laid, anomaly: AnomalyMap, site: Site) -> AsBuilt:
 
 
 def _deficit_options(site: Site) -> DeficitOptions:
-    """What nobody saw stands no higher than the job, where one has just been printed there."""
+    """The deficit's options; what a job has just printed limits how high unseen places stand."""
     options = site.options.deficit
     if site.laid is None and site.planned is None:
         return options
@@ -323,9 +344,10 @@ def _deficit_options(site: Site) -> DeficitOptions:
 def _among_finished(
     as_built: HeightField, laid: _Laid, anomaly: AnomalyMap, finished: Finished, site: Site
 ) -> HeightField:
-    """What stands on the bed, and what else of the job does: as it was printed, and as it is seen.
+    """The heights of the part joined with those of the job's finished objects beside it.
 
-    Over all of it: the nozzle comes from beside the job, and goes back there.
+    Those stand as they were printed, and as high as this scan shows them. The field covers all of
+    the job, since the nozzle comes from beside it and goes back there.
     """
     assert anomaly.evidence is not None
     points_mm = laid.placed.apply(laid.whole.points_mm)
@@ -347,7 +369,7 @@ def _slice(
     lines: JobLines | None,
     progress: Progress,
 ) -> PatchPlan:
-    """Toolpaths that fill what is missing, onto what stands there."""
+    """Slice the missing solids to beads, laid onto what stands there."""
     x_mm = y_mm = z_mm = 0.0
     if interruption is not None:
         x_mm, y_mm, z_mm = (float(axis) for axis in interruption.position_mm)
@@ -374,13 +396,13 @@ def _checked(
     interruption: ModalState | None,
     strict: bool,
 ) -> RepairPlan:
-    """The plan with its program, written and checked, or with the reason why it has none."""
+    """The plan with its program, written and checked; or with the checker's refusal."""
     assert plan.patch is not None
     as_built, printer = plan.deficit.as_built, site.setup.printer
     program = write(
         plan.patch.toolpath, site.setup, title=title, resume=interruption, restore=False
     )
-    # what the job bridges counts where the checker has followed it itself
+    # the checker allows the job's own bridges only if it has followed the job itself
     bridges = lines.bridges if lines is not None else None
     patch = bridges if isinstance(bridges, JobBridges) else True
     try:

@@ -1,4 +1,4 @@
-"""One scan's verdict, and the program that follows from it."""
+"""The plan of a repair: what one scan showed, and the program that follows from it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from amrepair.align.registration import Registration
 from amrepair.deficit import Deficit
 from amrepair.frames import Transform
-from amrepair.policy import USUAL_POLICY, PolicyOptions, worth
+from amrepair.policy import USUAL_POLICY, PolicyOptions, acceptance
 from amrepair.regions import AnomalyMap, Region
-from amrepair.regions.calibrating import Sound
+from amrepair.regions.error_calibration_fit import Sound
 from amrepair.scans import Scan
 from gcode.check import CheckedProgram
 from gcode.estimate import Estimate
@@ -18,23 +18,26 @@ from gcode.slicing.patch import PatchPlan
 
 @dataclass(frozen=True, slots=True)
 class RepairPlan:
-    """One scan's verdict, and the program that follows from it.
+    """What one scan showed, stage by stage, and the program that follows from it.
 
     Attributes
     ----------
-    checked
-        The program that fills what is missing; None where there is nothing that a bead can fill.
+    registration, anomaly, deficit
+        The results of alignment, detection, and of making solids.
     build_from_scan
         Where the scan lies on the bed.
     scan
-        What was judged, in the template's frame.
+        The points that were judged, in the template's frame.
     policy
-        By what was decided which regions are worth a repair.
+        The limits by which it is decided which regions are worth a repair.
+    patch, checked, estimate
+        The sliced beads, the checked program, its time and material. Each is None where the stage
+        was not reached: nothing is worth a repair, no bead fits, or the checker refused.
     refused
-        Why the checker refused the program, where it did and the caller wanted to go on.
+        The checker's reason, where it refused the program and the caller did not want an error.
     beds
-        What the bed beside the part showed of the scanner's errors, in this look and in earlier
-        ones of its run.
+        The scanner's errors as the bed beside the part showed them, in this look and in earlier
+        looks of the same run.
 
     Examples
     --------
@@ -64,30 +67,30 @@ class RepairPlan:
 
     @property
     def build_from_template(self) -> Transform:
-        """Where the part stands on the bed, as this scan shows it."""
+        """The part's pose on the bed, as this scan shows it."""
         return self.build_from_scan @ self.registration.template_from_scan.inverse()
 
     @property
     def to_fill(self) -> tuple[Region, ...]:
-        """Missing regions that are worth a repair: alone, or with those beside them."""
-        return worth.to_fill(self.deficit.regions, self.policy)
+        """The missing regions that are worth a repair."""
+        return acceptance.to_fill(self.deficit.regions, self.policy)
 
     @property
     def too_much(self) -> tuple[Region, ...]:
-        """Regions in excess that stand out."""
-        return worth.too_much(self.deficit.regions, self.layer_height_mm, self.policy)
+        """The regions of excess that are too much."""
+        return acceptance.too_much(self.deficit.regions, self.layer_height_mm, self.policy)
 
     @property
     def within_tolerance(self) -> bool:
-        """No region is left that is worth a repair, or that stands out."""
+        """Whether nothing is worth a repair and nothing is too much."""
         return not self.to_fill and not self.too_much
 
     @property
     def unreachable_mm3(self) -> float:
-        """Missing volume that the nozzle cannot get to."""
+        """The missing volume that the nozzle cannot reach."""
         return float(sum(u.volume_mm3 for u in self.patch.unreachable)) if self.patch else 0.0
 
     @property
     def unprintable_mm3(self) -> float:
-        """Missing volume that no bead fits, or that holds none."""
+        """The missing volume into which no bead fits, or in which none would hold."""
         return float(sum(u.volume_mm3 for u in self.patch.unprintable)) if self.patch else 0.0

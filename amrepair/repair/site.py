@@ -1,4 +1,4 @@
-"""What is expected where: all that a scan is held against."""
+"""A site: what is expected at one place and moment, and so all that a scan is compared with."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY, PolicyOptions
 from amrepair.regions import AnomalyMap, detect
-from amrepair.regions.calibrating import Sound
-from amrepair.regions.calibration import Calibration
-from amrepair.regions.skipped import PlannedBeads
+from amrepair.regions.error_calibration import Calibration
+from amrepair.regions.error_calibration_fit import Sound
+from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair.options import USUAL_REPAIR, RepairOptions
 from amrepair.scans import Scan
 from amrepair.template.laid import LaidBeads
@@ -27,19 +27,19 @@ from gcode.slicing.layers import LayerGrid
 from gcode.surfaces import HeightField
 
 Detector = Callable[..., AnomalyMap]
-"""`detect`, or what asks another process for the same."""
+"""The function that finds regions: `detect`, or one that asks another process to run it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Raft:
-    """What a job lays under a part, so that its foot is not on the bed.
+    """A raft that a job lays under a part, so that the part's foot is above the bed.
 
     Attributes
     ----------
     height_mm
-        How high over the bed the part's foot is.
+        How high the part's foot is above the bed.
     reach_mm
-        How far out of the part the raft goes.
+        How far the raft reaches beyond the part.
     """
 
     height_mm: float
@@ -48,22 +48,22 @@ class Raft:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """Objects of a job that have come to their end, beside the one that is printed now.
+    """Finished objects of a sequential job, which stand beside the one being printed.
 
     Attributes
     ----------
     standing
-        How high they stand, build frame, on the whole reach of the nozzle.
+        Their heights, build frame, over all that the nozzle reaches.
     theirs
-        (ny, nx) columns of it that are nearer to them than to the one that is printed now: what a
-        scan shows there is none of it.
+        (ny, nx) columns of `standing` that are nearer to them than to the object being printed;
+        scan points there belong to them.
     """
 
     standing: HeightField
     theirs: ColumnMask
 
     def own(self, xy_mm: Float[np.ndarray, "n 2"]) -> Mask:
-        """(n,) which places, build frame, are theirs."""
+        """(n,) which places, build frame, belong to the finished objects."""
         index = self.standing.cells_of(xy_mm)
         inside = ((index >= 0) & (index < self.standing.shape)).all(axis=1)
         index[~inside] = 0
@@ -72,64 +72,68 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What is expected where: all that a scan is held against.
+    """What is expected at one place and moment: all that a scan is compared with.
+
+    Only `template`, `setup` and `grid` are always needed. For a scan in mid-job the loop adds what
+    the job has printed so far (`amrepair.loop.sites`).
 
     Attributes
     ----------
     template
-        The expected geometry at this moment (a layer's cut, or the finished part); the scan is
-        aligned to it.
-    planned
-        Where the inside is planned to be open: the job's own beads, in the template's frame, by
-        which the last millimetres are judged instead.
+        The expected geometry: the finished part, or the part cut at the layer just printed. The
+        scan is aligned to it.
     setup
-        Printer, material, process.
+        The profiles of printer, material and process.
     grid
-        Layers of the job: repair layers lie on them.
+        The job's layers; the layers of a repair lie on them.
     build_from_template
-        Where the part stands on the bed; None where the scan is in the build frame and the
-        alignment itself says so.
+        Where the part stands on the bed. None where the scan is in the build frame, so that the
+        alignment tells.
     printed_z_mm
-        Height printed so far, build frame; None for a finished part.
+        The height printed so far, build frame; None for a finished part.
     allowance_mm
-        What the process may leave (half a layer for a CAD template, 0 for planned beads).
+        How far off the template the process may leave a surface: half a layer for a CAD template,
+        0 for planned beads.
     process_sigma_mm
-        By how much sound parts of the process depart as a whole: a quarter of a layer.
+        By how much the surface of sound parts wanders as a whole; about a quarter of a layer.
     calibration
-        What sound parts look like to this scanner; None: as the scan itself tells.
+        The errors of this scanner on sound parts; None takes what the scan itself tells.
     beds
-        What the bed beside the part showed of the scanner's errors in earlier looks.
+        The scanner's errors as the bed beside the part showed them in earlier looks.
+    planned
+        For a part with open infill: a template of the job's own beads, by which the last
+        millimetres are judged instead of by `template`.
     on_fixture
-        Somebody said that a finished part's foot is above the bed.
+        Whether somebody said that a finished part's foot is above the bed.
     part_is_known
-        Somebody said that the scan shows this part: less of it has to fit, as of `align`.
+        Whether somebody said that the scan shows this part, so that `align` accepts a poorer fit.
     damage_at_mm
-        (2,) where on the bed somebody said that the largest damage is; it tells the poses of a
+        (2,) where on the bed, as somebody said, the largest damage is: this tells the poses of a
         symmetric part apart.
     beads
-        What the job has laid so far, template frame: lines that were skipped are looked for.
+        The topmost beads that the job has laid, template frame; skipped lines are looked for among
+        them.
     lines
-        The same, all of it, build frame: a patch is laid along them.
+        All lines that the job has laid, build frame; a patch may follow them.
     surface
-        Points of what is expected and their normals, as `detect` asks for them: made beforehand.
+        Points and normals of the expected surface, made beforehand for `detect`.
     beside
-        How high skirt, brim and supports stand beside the part, build frame, where the template
-        does not have them; −inf where nothing does. They are none of the part, nor too much.
+        Heights of skirt, brim and supports that the template does not have, build frame; −inf
+        where there are none. They belong to no part, and are never too much.
     strands
-        How high supports stand that are planned, too, and strands may stray, build frame: they are
-        judged, but by as much as they may stray nothing there is too much or missing.
+        Heights of supports that the planned template does have, build frame. Their strands may
+        stray, so within that distance nothing is missing or too much there.
     raft
-        What a job lays under the part; None where it stands on the bed.
+        The raft under the part; None where it stands on the bed.
     finished
-        Objects of the job that have come to their end; None where it prints all at once, or the
-        first of them.
+        Finished objects of a sequential job; None where there are none.
     laid
-        The job's beads so far, build frame: what its own path puts beyond what is expected
-        (heights that are rounded up, plastic that has no room) is not too much.
+        The job's beads so far, build frame. Where the job's own path puts plastic beyond the
+        template (heights rounded up, no room for a bead), that is not too much.
     detector
-        What finds the regions: `detect`, or what asks another process for the same.
+        The function that finds the regions.
     options, policy
-        Numbers that are neither a profile's nor a measurement's.
+        The numbers that come from no profile and no measurement.
 
     Examples
     --------
@@ -175,16 +179,16 @@ class Site:
 
     @property
     def others(self) -> HeightField | None:
-        """What else of the job stands on the bed, build frame; None where nothing does."""
+        """Heights of the job's finished objects, build frame; None where there are none."""
         return None if self.finished is None else self.finished.standing
 
     @property
     def expected(self) -> Template:
-        """What the scan is judged by: the job's own beads where they are known."""
+        """What the scan is judged by: the planned template where there is one."""
         return self.planned or self.template
 
     def stands_at(self, scan: Scan, registration: Registration) -> Transform:
-        """Build from template: as told, or as seen by a scan that is in the build frame.
+        """The part's pose, build from template: as told, or from a scan in the build frame.
 
         Raises
         ------

@@ -1,4 +1,8 @@
-"""A symmetric part fits a scan in several poses: in which of them it stands, by its damage."""
+"""Symmetric parts: a scan fits in several poses, and the place of the damage tells which is true.
+
+Each pose would repair the same hole at another place of the bed. So a person is asked where on the
+bed the damage is, unless all poses lead to the same repair.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +83,7 @@ def registration_of_damage(
 
 @dataclass(frozen=True, slots=True)
 class _Repair:
-    """What would be filled in one of the poses, build frame; `at_mm` (2,) its largest piece."""
+    """What would be filled under one pose, build frame; `at_mm` (2,): its largest piece."""
 
     pose: Transform
     missing: manifold3d.Manifold
@@ -87,18 +91,18 @@ class _Repair:
 
     @property
     def place(self) -> str:
-        """As --damage-at takes it."""
+        """The place as --damage-at takes it."""
         return f"{self.at_mm[0]:.0f},{self.at_mm[1]:.0f}"
 
     def is_as(self, other: _Repair, ratio: float) -> bool:
-        """The two share at least so much of what they fill."""
+        """Whether the two fill the same place: they share at least this ratio of the volume."""
         if self is other:
             return True
         return bool((self.missing ^ other.missing).volume() >= ratio * self.missing.volume())
 
 
 def _repairs(site: Site, registration: Registration, deficit: Deficit) -> list[_Repair]:
-    """Of the best pose, then of the others: the same scanned hole, seen through each of them."""
+    """The same scanned hole under the best pose, and then under each of the alternatives."""
     assert site.build_from_template is not None
     largest = max(deficit.missing.decompose(), key=lambda piece: piece.volume())
     centre_mm = box_of_solid(largest).mean(axis=0)[None]

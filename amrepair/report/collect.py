@@ -17,7 +17,7 @@ from jaxtyping import Float
 from amrepair.arrays import Mask
 from amrepair.loop import Action, Look, LoopReport
 from amrepair.loop.afterwards import Afterwards
-from amrepair.loop.buried import buried_mm3, pieces_of
+from amrepair.loop.buried_defects import buried_mm3, pieces_of
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
 from amrepair.observe.options import USUAL_BACKGROUND

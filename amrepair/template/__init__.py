@@ -1,10 +1,15 @@
 """Templates: the part as it should be, as a signed distance field.
 
-Exact on an adaptive grid (`GridSdf`), that grid taught by sound scans (`LearnedSdf`), the published
-network (`PaperSdf`), exact and slow (`MeshSdf`), planned from the job's beads (`PlannedSdf`); a
-layer's cut of any of them, and copies as they stand on the bed (`StoodTemplate`). It does not know
-scans' poses, nor what is done about a difference. torch is imported only by `PaperSdf`, and while
-one is fitted.
+All kinds answer the same questions (`port.Template`):
+
+- `GridSdf`: distances from a mesh on a grid that is finer where the surface bends; the usual kind;
+- `LearnedSdf`: such a grid, corrected by scans of sound parts;
+- `MeshSdf`: exact distances to a mesh, without fitting, but slow;
+- `PlannedSdf`: the solid that a job's own beads make;
+- `PaperSdf`: the published neural network, for comparison; only this one imports torch;
+- `CutTemplate`: any of them cut at a layer; `StoodTemplate`: copies of one as they stand on a bed.
+
+The room does not know the poses of scans, nor what is done about a difference.
 """
 
 from amrepair.template.cut import CutTemplate

@@ -1,4 +1,4 @@
-"""What templates are read and fitted by: each number once."""
+"""Options of reading and fitting templates: each number once."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class MeshOptions:
-    """Which meshes are a part, and what of them is mended.
+    """Which meshes are accepted as a part, and what of them is repaired.
 
     Attributes
     ----------
     sew_ratio
-        Of the extent: narrower cracks are closed, 0.01 mm on a part of 100 mm.
+        Cracks narrower than this share of the part's extent are closed: 0.01 mm on 100 mm.
     least_part_mm
-        A printer that prints smaller ones lays no beads.
+        A smaller part is refused: no printer lays beads so small.
     most_lid_edges
-        A larger hole has a shape that we do not know.
+        A hole with more edges than this is not closed, since nobody knows its shape.
     most_open_ratio
-        More open edges than this share of all is a bag of polygons, not a surface with a hole.
+        A mesh of which more than this share of all edges is open is a bag of polygons rather than a
+        surface with a hole.
     """
 
     sew_ratio: float = 1e-4
@@ -29,31 +30,31 @@ class MeshOptions:
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
-    """The fast recipe: a grid of exact distances, finer where it bends.
+    """The fast recipe: a grid of exact distances, finer where the surface bends.
 
     Attributes
     ----------
     cells
-        Along the longest side, at least.
-    stocky_ratio
-        Long and flat parts have flat boxes: as many nodes as a part that fills this share of the
-        cube over its longest side, in smaller cells.
-    most_divided
-        Times as many cells along that side.
+        The least number of cells along the part's longest side.
+    stocky_ratio, most_divided
+        Long and flat parts have flat boxes, and get smaller cells: until the grid has as many nodes
+        as that of a part which fills this share of the cube over its longest side, but at most
+        `most_divided` times as many cells along that side.
     margin_ratio
-        Of the longest side, around the part.
+        Margin around the part, as a share of its longest side.
     exact_cells
-        Nearer nodes are measured against every triangle.
+        Nodes nearer to the surface than this many cells get their exact distance to all triangles.
     fine
-        A cell that bends is divided into so many along each edge.
+        A cell in which the surface bends is divided into this many along each edge.
     samples, band_cells
-        Places where the grid is compared, so far around the surface.
+        At how many places the grid is compared with exact distances, and how far around the
+        surface, in cells.
     held_out
-        Places that its bias is told from.
+        The number of further places from which its bias is estimated.
     least_residual_mm
-        Cells where the grid is better are left as they are.
+        Cells in which the grid is off by less are not divided.
     most_blocks
-        60 MB; the worst cells go first.
+        The largest number of divided cells (60 MB); the worst cells are divided first.
     """
 
     cells: int = 128
@@ -76,13 +77,14 @@ class PlannedOptions:
     Attributes
     ----------
     depth_mm
-        Under the last layer: so deep a defect is looked for.
+        How deep below the last layer beads are held, and so defects are looked for.
     margin_mm
-        Around the beads.
+        Margin around the beads.
     below_beads_mm
-        Below its lowest beads nothing is planned: the bed is there, or what was looked at before.
+        How far the grid reaches below the lowest beads. Nothing is planned there: it is the bed, or
+        was looked at before.
     least_voxel_mm, most_voxel_mm, most_voxels
-        Edge of a voxel, and how many there may be: else they are larger.
+        Limits of a voxel's edge, and the largest number of voxels; a larger grid is refused.
     """
 
     depth_mm: float = 4.0

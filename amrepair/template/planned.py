@@ -1,9 +1,9 @@
 """`PlannedSdf`: what a layer should look like, from the job's own beads.
 
-Sparse infill is no defect: the expected solid is the union of the beads that were planned, told
-as a distance field between voxels of about a layer's height. Only the last millimetres below the
-layer are held; what is farther down was looked at before, and is covered: there the field says
-outside, so that nothing is ever missing below it.
+Sparse infill is no defect, so what is expected of a layer is the union of the planned beads. It is
+held as a distance field on voxels of about a layer's height, for the last millimetres below the
+layer. Farther down everything was inspected before and is covered now: there the field says
+"outside", so that nothing is ever missing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The `Template` port: the part as it should be, as a signed distance field.
 
-Negative inside, mm, in the `template` frame. Every implementation answers the same questions;
-those who ask never know whether the field was learned, exact or planned from G-code.
+Distances are in mm, in the `template` frame, and negative inside. Every implementation answers the
+same questions, so that callers need not know whether a field is learned, exact or planned from
+G-code.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from amrepair.arrays import Box, Points, Values
 
 @runtime_checkable
 class Distances(Protocol):
-    """A signed distance field: all that a pose is refined by."""
+    """A signed distance field: all that the refinement of a pose needs."""
 
     def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance at (n, 3) points, mm, negative inside."""
@@ -48,13 +49,13 @@ class Template(Distances, Protocol):
 
 @runtime_checkable
 class OnGrid(Protocol):
-    """A template whose field compiled code can ask by itself."""
+    """A template on a grid that compiled code can read directly."""
 
     @property
     def grid_numbers(self) -> tuple[Any, ...]:
-        """What `trilinear_kernels.field_at` takes after a point."""
+        """The arguments that `trilinear_kernels.field_at` takes after a point."""
 
 
 def is_off_bed(template: Template) -> bool:
-    """Whether its foot is a cut in mid-air, as that of planned beads, and not the bed's height."""
+    """Whether its lowest plane is a cut in mid-air, as of planned beads, and not the bed."""
     return bool(getattr(template, "off_bed", False))

@@ -1,4 +1,9 @@
-"""`check`: all rules over one program; the only maker of a `CheckedProgram`."""
+"""`check`: applies all rules to one program. Nothing else can make a `CheckedProgram`.
+
+The text is followed line by line with the machine's state (`motion`, `rules`). Where something
+stands on the bed, the tool head is then swept along all moves (`sweep`), and what a patch lays over
+air is judged (`hanging`).
+"""
 
 from __future__ import annotations
 
@@ -25,18 +30,18 @@ OUR_MARK = re.compile(r"^;AMREPAIR:", re.MULTILINE)  # before each script that o
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a program was found to be.
+    """The result of judging a program.
 
     Attributes
     ----------
     refusals
-        In the program's order; empty where nothing speaks against it.
+        The reasons against printing it, in the program's order; empty where there are none.
     report
-        What was judged, by which policy, with its warnings and what was added at the end.
+        What was judged and by which policy, with warnings and with lines added at the end.
     contact
-        Where the head first touches what stands there; None where it does not, or nothing stands.
+        Where the head first touches what stands there; None where it touches nothing.
     moves
-        All moves with known ends, for a picture; None where nothing stands that they might touch.
+        All moves with known ends, for a picture; None where nothing stands on the bed.
     """
 
     refusals: tuple[Refusal, ...]
@@ -46,7 +51,7 @@ class Verdict:
 
 
 def policy_of(program: Program) -> Policy:
-    """Whose program it is: strict for our own, by the marks that our writer leaves in it."""
+    """The policy that suits a program: strict for our own, known by the marks of our writer."""
     return Policy.STRICT if OUR_MARK.search(program.text) else Policy.DANGER
 
 
@@ -59,7 +64,7 @@ def find_refusals(
     policy: Policy = Policy.STRICT,
     patch: bool | JobBridges = False,
 ) -> tuple[Refusal, ...]:
-    """Everything that speaks against printing a program, in its order; see `check`."""
+    """All reasons against printing a program, in its order; see `check`."""
     return judge(
         program, setup, as_built=as_built, initial=initial, policy=policy, patch=patch
     ).refusals
@@ -77,27 +82,28 @@ def check(
     patch: bool | JobBridges = False,
     progress: Progress = silent,
 ) -> CheckedProgram:
-    """Judge a program.
+    """Judge a program, and prove that it may be printed.
 
     Parameters
     ----------
     setup
-        The printer that it is for, and its material.
+        The printer that the program is for, and its material.
     as_built
-        What stands on the bed, build frame; the tool head is swept against it, and Z is not homed.
+        The heights of what stands on the bed, build frame. The tool head is swept against it, and
+        the program must not home Z.
     initial
-        The machine's state before the first line, for a program within a job; None: a machine
-        that is cold and not homed (with `as_built`: not homed in X and Y, its Z still true).
+        The machine's state before the first line, for a program in mid-job. None stands for a
+        machine that is cold and not homed; with `as_built`, one whose Z is still true.
     policy
-        `policy_of` tells which suits a file. By `DANGER` the report has warnings, and heaters that
-        the program leaves on are switched off by lines at its end.
+        How strictly to judge; `policy_of` tells which policy suits a file. By `DANGER` some
+        refusals become warnings, and heaters left on are switched off by lines added at the end.
     leave_heaters
-        The program may leave its heaters on.
+        Whether the program may leave its heaters on.
     touches
-        Where the program may feel for what stands there (G38.2), and how deep; nowhere else.
+        Where, and how deep, the program may feel with the nozzle for what stands there (G38.2).
     patch
-        It fills something in `as_built`: what it lays over air is judged as well; by what its job
-        bridges too, where that is known.
+        Whether the program fills something in `as_built`, so that what it lays over air is judged
+        as well; and where it is known, what the patch's job bridges.
 
     Raises
     ------
@@ -140,7 +146,7 @@ def judge(
     patch: bool | JobBridges = False,
     progress: Progress = silent,
 ) -> Verdict:
-    """What `check` goes by, for whoever wants to know and not to print."""
+    """Judge a program without proving anything: for those who want to know, not to print."""
     if program.dialect not in KNOWN_COMMANDS:
         raise InputError(
             f"There is no dialect '{program.dialect}' to check; "

@@ -31,11 +31,11 @@ class Contact:
     Attributes
     ----------
     line
-        Of the program, counted from 1.
+        The line of the program, counted from 1.
     place_mm
-        Where the nozzle's tip is then, build frame.
+        Where the nozzle's tip is at that moment, build frame.
     what
-        As the refusal says it.
+        Which part of the head touches, in the words of the refusal.
     """
 
     line: int
@@ -51,12 +51,12 @@ class Contact:
 def contact_of(
     refusal: Refusal, moves: Moves, printer: PrinterProfile, as_built: HeightField
 ) -> Contact:
-    """The place of a refusal of the sweep.
+    """Find the place to which a refusal of the sweep belongs.
 
     Parameters
     ----------
     moves
-        Of the whole program.
+        The moves of the whole program.
     """
     own = np.flatnonzero(moves.line == refusal.line)
     starts, ends = moves.start_mm[own], moves.end_mm[own]

@@ -20,11 +20,11 @@ class Touch:
     Attributes
     ----------
     x_mm, y_mm
-        Where, build frame.
+        The place, build frame.
     surface_mm
-        Height of what is to be felt there.
+        The expected height of the surface there.
     lowest_mm
-        No touch may be told to go deeper.
+        The lowest height to which the touch may be sent.
     """
 
     x_mm: float
@@ -34,12 +34,12 @@ class Touch:
 
 
 class Policy(StrEnum):
-    """Whose program it is, and so what is refused.
+    """What is refused, by whose program it is.
 
-    `STRICT`, for programs of our own, holds them to every figure of the profiles. `DANGER`, for a
-    user's own job, refuses what can hurt and tells the rest: what a profile says of flow, speed,
-    acceleration and bead size is what its machine prints well with, and whoever prints a job every
-    day knows better.
+    `STRICT` is for our own programs, and holds them to every figure of the profiles. `DANGER` is
+    for a user's own job: it refuses what can do damage, and only warns of the rest. A profile's
+    figures of flow, speed, acceleration and bead size are those with which its machine prints
+    well, and a user who prints a job every day may know better.
     """
 
     STRICT = "strict"
@@ -53,13 +53,13 @@ class Refusal:
     Attributes
     ----------
     line
-        Line of the text, counted from 1.
+        The number of the line, counted from 1.
     text
-        That line.
+        The line itself.
     what
-        What is wrong.
+        What is wrong with it.
     value, limit
-        As text with units.
+        The value found and the limit, as text with units.
     """
 
     line: int
@@ -77,14 +77,14 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Warned:
-    """One thing that is told of many lines: beyond a profile's figures, or refused.
+    """One kind of warning or refusal, told once for all lines that it applies to.
 
     Attributes
     ----------
     lines
-        How many lines do it.
+        How many lines it applies to.
     worst
-        The line that goes furthest beyond; the first one of what is refused.
+        The line that goes furthest beyond the limit; of refusals, the first line.
     """
 
     lines: int
@@ -96,7 +96,7 @@ class Warned:
 
 
 def by_kind(refusals: Iterable[Refusal]) -> tuple[Warned, ...]:
-    """The first refusal of each kind, with how many there are of it."""
+    """Gather refusals by kind: the first of each, with the number of lines."""
     found: dict[str, Warned] = {}
     for refusal in refusals:
         before = found.get(refusal.what, Warned(0, refusal))
@@ -105,13 +105,13 @@ def by_kind(refusals: Iterable[Refusal]) -> tuple[Warned, ...]:
 
 
 class Warnings:
-    """Warnings by what they are about."""
+    """Warnings, gathered by kind."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[int, float, Refusal]] = {}
 
     def add(self, refusal: Refusal, over_ratio: float) -> None:
-        """One more line that goes so many times beyond its limit."""
+        """Add a line that goes beyond its limit by a ratio."""
         count, worst_ratio, worst = self._found.get(refusal.what, (0, -1.0, refusal))
         if over_ratio > worst_ratio:
             worst_ratio, worst = over_ratio, refusal

@@ -1,9 +1,10 @@
-"""What a patch lays over air: every strand there ends, both ways, on something that holds it.
+"""What a patch lays over air: every strand must end, both ways, on something that holds it.
 
-A bead is held where something stands beside it or under it, or lies where the floor is near below.
-Where neither is, it hangs: a bridge, straight from one hold to the next, no longer than its
-material bears, or than the job that it mends spans itself. What was laid in the same pass holds
-nothing, so each strand is judged as if it were alone; what fell onto a floor holds no strand's end.
+A bead is held where something stands beside it or under it, or where the floor is near below. Where
+neither is the case it hangs, and must be a bridge: straight from one hold to the next, and no
+longer than its material bears, or than the patch's job spans itself. What was laid in the same pass
+holds nothing, so that each strand is judged as if it were alone. What fell onto a floor does not
+hold a strand's end.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ MOST_CELLS = 4_000_000
 
 
 class JobBridges:
-    """What a job's own lines span over air: its slicer trusts this printer and material with it.
+    """What a job's own lines bridge over air, since its slicer trusts printer and material so far.
 
-    Followed by the rule that patches are judged by, over what the job itself has laid below, from
-    an empty bed up; comments count for nothing. Only when it is first asked for.
+    The job's lines are judged by the same rule as a patch, from an empty bed up, when the answer is
+    first asked for; the slicer's comments are ignored.
 
     Parameters
     ----------
@@ -88,9 +89,9 @@ def hanging(
     as_built: HeightField,
     job: JobBridges | None = None,
 ) -> list[Refusal]:
-    """Refusals for strands over air that are not held at both ends, or span too much.
+    """A refusal for every strand over air that is not held at both ends, or is too long.
 
-    Too much is more than the material bears, and more than the `job` itself bridges.
+    Too long is more than the material bears, and more than the `job` itself bridges.
     """
     laid = moves.pushed_mm3 > 0
     if not laid.any() or not as_built.z_mm.size:
@@ -129,14 +130,14 @@ def hanging(
 
 
 def _over_air_mm(span_mm: float) -> float:
-    """How far a bead of a span goes over air where nothing is beside it."""
+    """The part of a span over which nothing is beside the bead."""
     return max(span_mm + SPAN_SLACK_MM - 2 * BESIDE_MM, 0.0)
 
 
 def _box(
     start_mm: Float[np.ndarray, "n 3"], end_mm: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
-    """Low and high corner of all that may hold some moves."""
+    """The lowest and highest corner of the area in which something may hold some moves."""
     both = np.concatenate([start_mm[:, :2], end_mm[:, :2]])
     low, high = both.min(axis=0), both.max(axis=0)
     return low - BESIDE_MM, high + BESIDE_MM
@@ -151,7 +152,7 @@ def _followed(
     bore_mm: float,
     longest_mm: float,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """What is wrong with the stretch over air that a move ends, and how long that is, mm."""
+    """For each move that ends a stretch over air, what is wrong with that, and its length."""
     return kernels.follow(
         np.ascontiguousarray(start_mm),
         np.ascontiguousarray(end_mm),
@@ -175,7 +176,7 @@ def _followed(
 
 
 def _beside(cell_mm: float) -> np.ndarray:
-    """(c, 2) rows and columns of all cells beside one, itself first."""
+    """(c, 2) offsets, in rows and columns, of all cells beside a cell; itself first."""
     reach = int(BESIDE_MM / cell_mm + 0.5)
     rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
     apart_mm = np.hypot(rows, columns) * cell_mm

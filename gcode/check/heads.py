@@ -1,7 +1,7 @@
-"""The heads of a machine, as lines of a program change them: heaters, and filament pulled back.
+"""The heads of a machine as a program changes them: their heaters, and filament pulled back.
 
-Most machines have one. Of several filaments to one nozzle there is one head, too. It knows no
-command (`rules`).
+Most machines have one head; several filaments that go to one nozzle share one, too. Which command
+changes a head is known to `commands`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ class Hotend:
     Attributes
     ----------
     target_c, standby_c
-        What it is heated to, and what while it waits; the second where a firmware has one.
+        Its target temperature; and that while another head is chosen, where the firmware has one.
     ready_c
-        What was waited for: it is as hot as that at least.
+        The temperature that was waited for, so that it is at least as hot.
     pulled_mm
-        Filament that is pulled back in it.
+        How far its filament is pulled back.
     loads
-        Another filament was taken, and nothing is printed of it yet.
+        Whether another filament was chosen, of which nothing has been printed yet.
     """
 
     target_c: float = 0.0
@@ -39,18 +39,18 @@ class Hotend:
     loads: bool = False
 
     def heat(self, target_c: float, *, waits: bool) -> None:
-        """The heater is waited for, or cools from now on, or gets there when it does."""
+        """Set the target; the head is ready by it if it is waited for, or if it only cools."""
         self.target_c = target_c
         if waits or target_c < self.ready_c:
             self.ready_c = target_c
 
     def off(self) -> None:
-        """Switched off, by a word that stands for all heaters."""
+        """Switch the head off, by a command for all heaters."""
         self.target_c = self.ready_c = self.standby_c = 0.0
 
 
 def heads_of(printer: PrinterProfile, state: ModalState | None) -> tuple[list[Hotend], int]:
-    """A printer's heads in the state that they begin in, and which is chosen."""
+    """A printer's heads as they are before the first line, and the number of the chosen one."""
     heads = [Hotend() for _ in range(printer.nozzles)]
     chosen = 0
     if state is not None:
@@ -67,12 +67,12 @@ def heads_of(printer: PrinterProfile, state: ModalState | None) -> tuple[list[Ho
 def switching_off(
     heads: list[Hotend], chosen: Hotend | None, dialect: str
 ) -> list[tuple[str, float, str]]:
-    """By head that is left on: what it is called, its temperature, the line that is lacking.
+    """For each head left on: its name, its temperature, and the line that would switch it off.
 
     Parameters
     ----------
     chosen
-        None where all of them wait.
+        The chosen head; None where none is, so that all wait.
     """
     found = []
     for k, head in enumerate(heads):

@@ -1,6 +1,7 @@
-"""Rules of moves: where they go, how fast, and what plastic they lay; the machine's state.
+"""Rules of moves: where they may go, how fast, and how much plastic they may lay.
 
-It knows what moves mean in a dialect, and no other command (`rules`).
+This module holds the machine's state as moves change it, and knows what moves mean in a dialect.
+All other commands are those of `commands` and `rules`.
 """
 
 from __future__ import annotations
@@ -57,11 +58,11 @@ class Motion:
     Parameters
     ----------
     standing_top_mm
-        Height of what stands on the bed; None for a bare bed.
+        The height of what stands on the bed; None for a bare bed.
     initial
-        The machine's state before the first line; None: cold and not homed.
+        The machine's state before the first line; None for a machine that is cold and not homed.
     policy
-        Whether what is beyond the profiles' figures is refused, or told.
+        Whether what goes beyond the profiles' figures is refused, or only told.
     """
 
     def __init__(
@@ -112,9 +113,10 @@ class Motion:
         )  # fmt: skip
 
     def follow(self, text: Text, first: int, end: int) -> int:
-        """Judge plain moves among the lines first to end - 1; returns the first other line.
+        """Judge plain moves from line `first` on, by compiled code; returns the first other line.
 
-        What `read` would refuse is left to it, so that both say the same.
+        It stops before `end`, and at any line that is no plain move or that `Judge.read` might
+        refuse: that line is left to `read`, so that there is only one judgement.
         """
         if None in self._place or not all(self._homed):
             return first
@@ -146,12 +148,15 @@ class Motion:
 
     @property
     def _area_mm2(self) -> float:
-        """Plastic that a millimetre of E is, at the present flow."""
+        """The area by which a length of E becomes a volume, at the current flow factor."""
         return self._filament_mm2 * self._factor["M221"]
 
     @property
     def _cold(self) -> bool:
-        """Whether no line has waited for a hotend that melts; what a macro did only it knows."""
+        """Whether no line has waited until the hotend melts plastic.
+
+        In a user's job a macro may have heated it, and is given the benefit of the doubt.
+        """
         may_be_hot = self._heats_unsaid and self._lenient
         return self._head.ready_c < self._setup.printer.min_extrude_c and not may_be_hot
 
@@ -167,7 +172,7 @@ class Motion:
 
     @property
     def _top_mm(self) -> float | None:
-        """How high what stands there is, as far as is known; None where nothing is."""
+        """The height of what stands on the bed, as far as it is known; None where nothing does."""
         return max(self.moves.sums.top_mm, self._standing_top_mm or 0.0) or None
 
     @property
@@ -175,7 +180,7 @@ class Motion:
         return self._head.target_c >= self._setup.printer.min_extrude_c and self._occupied
 
     def _backwards(self, text: Text) -> None:
-        """Relative values of E that are read as absolute go back and forth."""
+        """Refuse a program whose E goes back and forth: relative values, read as absolute ones."""
         sums = self.moves.sums
         if sums.pulled < BACKWARDS_MOVES:
             return
@@ -195,7 +200,12 @@ class Motion:
     def _beyond(
         self, what: str, value: str, limit: str, over_ratio: float, gross: float = GROSS
     ) -> bool:
-        """So many times a figure of the profile's: told in a user's job, if it is not gross.
+        """Refuse what goes beyond a figure of the profile; in a user's job only warn of it.
+
+        Parameters
+        ----------
+        over_ratio, gross
+            How many times the figure it is; a user's job is refused, too, beyond `gross`.
 
         Returns
         -------
@@ -265,10 +275,11 @@ class Motion:
         self._go(target, self._pushed(words), moved=bool(moved))
 
     def _unhomed(self, axis: int, words: dict[str, float | None]) -> None:
-        """Up and away from the bed is told in a user's job, where firmwares do it.
+        """Judge a move of an axis that is not homed: refuse it, or warn of it in a user's job.
 
-        So is any move where the firmware knows better: it has homed and heated by itself before the
-        job, or goes nowhere.
+        A warning is enough for a move up, away from the bed, which firmwares carry out; and for any
+        move on firmwares that either have homed and heated by themselves before the job, or do not
+        move at all.
         """
         value = (words["XYZ"[axis]] or 0.0) * self._unit
         to_mm = value if self._absolute else self._risen_mm + value
@@ -378,10 +389,11 @@ class Motion:
         return not (x0 <= place[0] <= x1 and y0 <= place[1] <= y1)
 
     def _bounded(self, target: list[float | None], *, lays: bool) -> list[float | None]:
-        """Where the head comes to.
+        """Refuse a target out of reach; returns where the head comes to, None where not known.
 
-        Off a bed that a slicer has told, and no more, its job may know its way; what is far off the
-        firmware cuts short, at a place that nobody has told.
+        Where the bed's size comes from a slicer and the machine's reach is not known, a user's job
+        may go somewhat off the bed. Some firmwares cut a move short that goes far off; where the
+        head comes to is then not known.
         """
         printer, reached = self._setup.printer, list(target)
         x0, y0, x1, y1 = printer.reach_box_mm
@@ -442,7 +454,7 @@ class Motion:
         self._melts(section_mm2)
 
     def _melts(self, section_mm2: float) -> None:
-        """So much plastic for each millimetre that the feed counts."""
+        """Judge the flow of a section of plastic, for each millimetre that the feed rate counts."""
         flow = section_mm2 * self._feed_mm_s * self._factor["M220"]
         limit = self._setup.max_volumetric_mm3_s
         if flow > FLOW_SLACK * limit:
@@ -451,7 +463,7 @@ class Motion:
             self._beyond("melts more than the hotend can", *told, flow / limit, math.inf)
 
     def _short(self, pushed_mm: float, length_mm: float) -> None:
-        """Standing, or nearly so: plastic adds up until the nozzle has moved on."""
+        """Judge plastic pushed while the nozzle hardly moves: it adds up until that moves on."""
         printer = self._setup.printer
         if pushed_mm < 0:
             self._pull(pushed_mm)
@@ -474,7 +486,7 @@ class Motion:
             self._short_mm3 = 0.0
 
     def _fresh_mm3(self, pushed_mm: float) -> float:
-        """What leaves the nozzle of what is pushed: first comes back what was pulled."""
+        """The plastic that leaves the nozzle by a push; filament pulled back comes back first."""
         back_mm = min(pushed_mm, self._head.pulled_mm)
         self._head.pulled_mm -= back_mm
         return (pushed_mm - back_mm) * self._area_mm2

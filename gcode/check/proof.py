@@ -1,4 +1,4 @@
-"""`CheckedProgram`: the proof that a program has passed; nobody else can make one."""
+"""`CheckedProgram`: the proof that a program has passed. Only the checker can make one."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class CheckReport:
     Attributes
     ----------
     commands, moves
-        How many.
+        How many there were.
     swept
         Whether the tool head was swept against what stands on the bed.
     least_clearance_mm
         The smallest distance by which a part of the head above the tip cleared it; None where
         nothing was swept.
     policy
-        By what it was judged.
+        The policy by which it was judged.
     warnings
-        What goes beyond the profiles' figures, where that policy lets it.
+        What goes beyond the profiles' figures, where the policy permits that.
     added
-        Lines that were put at its end, because it left heaters on.
+        Lines that were added at its end because it left heaters on.
     """
 
     commands: int
@@ -77,7 +77,7 @@ class CheckedProgram:
 
     @property
     def program(self) -> Program:
-        """The text, with what was put at its end, and its dialect."""
+        """The text, with lines added at its end, and its dialect."""
         return self._program
 
     @property

@@ -1,8 +1,8 @@
-"""The nozzle is a body: its envelope, swept along every move over what stands on the bed.
+"""The tool head is a body: its envelope is swept along every move over what stands on the bed.
 
-Slices of the envelope reach up to the next one, and the last to infinity; over a height field
-only what looks down can touch, lower faces and cones. What is laid on the way stands there for the
-moves after it, as wide and as high as `surfaces.standing` says: the planner goes by the same.
+The envelope consists of slices, each of which reaches up to the next one, and the last to infinity.
+Over a height field only its lower faces and cones can touch anything. What a move lays stands there
+for the moves after it, as wide and as high as `surfaces.standing` says, which the planner uses too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MOST_SAID = 20
 def sweep(
     moves: Moves, text: Text, printer: PrinterProfile, as_built: HeightField
 ) -> tuple[list[Refusal], float]:
-    """Refusals for every move that touches, and the least clearance of the body."""
+    """A refusal for every move on which the head touches, and the body's least clearance."""
     if not moves.count or not as_built.z_mm.size:
         return [], np.inf
     start, end, line = moves.start_mm, moves.end_mm, moves.line
@@ -87,7 +87,7 @@ def sweep(
 def deepest_along(
     places_mm: Float[np.ndarray, "n 3"], printer: PrinterProfile, as_built: HeightField
 ) -> Float[np.ndarray, " n"]:
-    """(n,) how deep the head is in what stands there, the tip at each place; ≤ 0: it is clear."""
+    """(n,) how deep the head is in what stands there, with the tip at each place; ≤ 0: clear."""
     return deepest_of_moves(places_mm, places_mm, printer, as_built)[0]
 
 
@@ -97,9 +97,9 @@ def deepest_of_moves(
     printer: PrinterProfile,
     as_built: HeightField,
 ) -> tuple[Float[np.ndarray, " n"], tuple[EnvelopeSlice, ...]]:
-    """(n,) how deep the head comes into what stands there on each move, and which of its parts.
+    """(n,) how deep the head comes into what stands there on each move, and with which part.
 
-    Beyond what is allowed; ≤ 0: it is clear. What the moves themselves lay is not asked about.
+    Depths are beyond what is allowed; ≤ 0 means clear. What the moves themselves lay is ignored.
     """
     tallest_mm = as_built.top_mm
     lowest_mm = float(min(start_mm[:, 2].min(), end_mm[:, 2].min()))
@@ -113,7 +113,7 @@ def deepest_of_moves(
 
 @dataclass(frozen=True, slots=True)
 class _Swept:
-    """Moves: (n, 3) start and end, (n,) plastic and half the width that it stands as."""
+    """Moves with (n, 3) start and end, (n,) volume of plastic, and half the width of their bead."""
 
     start_mm: Float[np.ndarray, "n 3"]
     end_mm: Float[np.ndarray, "n 3"]
@@ -128,9 +128,9 @@ class _Swept:
     def over(
         self, field: HeightField, slices: list[EnvelopeSlice], *, grows: bool
     ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]] | None:
-        """Worst contact of every move, beyond what is allowed, and the slice.
+        """The deepest contact of every move, beyond what is allowed, and the slice that touches.
 
-        With `grows`, what is laid stands there for the moves after it.
+        With `grows`, what a move lays stands there for the moves after it.
         """
         if not slices:
             return None

@@ -1,4 +1,4 @@
-"""What speaks against a touch of a standing part: only what its caller planned is allowed."""
+"""Touches of a standing part: only those are allowed that the caller has planned."""
 
 from __future__ import annotations
 

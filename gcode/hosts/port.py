@@ -1,7 +1,7 @@
 """The `Printer` port: what any machine can be asked for, whatever carries the bytes.
 
-Adapters live beside this file (`serial`, `octoprint`, `moonraker`, `file`). A printer prints
-checked programs only; it does not judge, make or alter them.
+Its adapters are modules beside this one: `serial`, `octoprint`, `moonraker` and `file`. A printer
+prints checked programs only; it does not judge, make or alter them.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class Temperatures:
     Attributes
     ----------
     hotend_c, hotend_target_c
-        Of the head that is chosen; where the printer does not tell which, of the one that is told
-        to be hottest.
+        Of the chosen head; where the printer does not say which is chosen, of the head with the
+        highest target.
     targets_c
-        Of each of several heads.
+        The targets of all heads, where there are several.
     """
 
     hotend_c: float
@@ -52,7 +52,7 @@ class Temperatures:
 
     @property
     def hotend_targets_c(self) -> tuple[float, ...]:
-        """By head, as many as there are."""
+        """The target of each head."""
         return self.targets_c or (self.hotend_target_c,)
 
 
@@ -65,7 +65,7 @@ class Capabilities:
 
     @classmethod
     def told(cls, answers: Iterable[object]) -> Capabilities:
-        """From the answers to M115."""
+        """Read from the answers to M115."""
         firmware, caps = "", {}
         for answer in answers:
             if isinstance(answer, FirmwareInfo):
@@ -82,7 +82,7 @@ class PrintReport:
     Attributes
     ----------
     ok
-        Every line is acknowledged and proved to have been received.
+        Whether every line is acknowledged, and proved to have been received.
     lines_acked
         Program lines acknowledged (comments and empty lines are never sent).
     first_line, next_line
@@ -106,22 +106,22 @@ class PrintReport:
 
 @runtime_checkable
 class PullsAtRest(Protocol):
-    """A printer whose job pauses by a macro of its user's, which may pull filament back."""
+    """A printer on which pauses run a macro of the user, which may pull filament back."""
 
     def pulled_at_rest_mm(self) -> float:
-        """Filament that the pause has pulled back, beyond what the job had."""
+        """Length of filament that the pause has pulled back, beyond what the job itself had."""
 
 
 @runtime_checkable
 class LeavesOut(Protocol):
-    """A printer whose server prints the job, and can leave an object of it out by itself."""
+    """A printer whose server prints the job and can leave out an object of it by itself."""
 
     def leave_out(self, name: str) -> None:
-        """Print nothing more of an object, whose name is the job's."""
+        """Print nothing more of the object with this name in the job."""
 
 
 class NothingMetError(PrinterError):
-    """A touch ended where it was to end, and met nothing; heaters are off, the nozzle is lifted."""
+    """A touch went as deep as it may and met nothing; heaters are off, the nozzle is lifted."""
 
 
 class LinesInDoubtError(LinkError):
@@ -152,7 +152,7 @@ class LinkLostError(LinesInDoubtError):
 
 
 class ResumeRefusedError(LinesInDoubtError):
-    """A job cannot be gone on with."""
+    """A job cannot be resumed."""
 
 
 @runtime_checkable
@@ -171,7 +171,7 @@ class Printer(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of the printer; harmless when not connected."""
+        """Close the link; harmless when not connected."""
 
     def capabilities(self) -> Capabilities:
         """Return what the firmware says it can do."""
@@ -205,13 +205,13 @@ class Printer(Protocol):
         """Return when every buffered move has been made (M400)."""
 
     def pause(self) -> None:
-        """Stop after the line under way, lift the nozzle; from another thread than `print`."""
+        """Stop after the current line, lift the nozzle; called from another thread than `print`."""
 
     def resume(self) -> None:
-        """Go back to where the pause began and go on."""
+        """Move back to where the pause began, and continue."""
 
     def abort(self) -> None:
-        """End the job: nothing more is sent, heaters off, nozzle lifted."""
+        """End the job: send nothing more, switch heaters off, lift the nozzle."""
 
     def emergency_stop(self) -> None:
         """Stop everything now; the printer must be reset afterwards."""
@@ -236,7 +236,7 @@ class TellsTouches(Printer, Protocol):
     def touch(
         self, checked: PrintableProgram, lines: range, *, progress: Progress = silent
     ) -> float:
-        """Carry out lines, the last of them a touch; where it met something, mm in G-code's Z.
+        """Carry out lines of which the last is a touch; the Z at which it met something, mm.
 
         Raises
         ------
@@ -247,14 +247,14 @@ class TellsTouches(Printer, Protocol):
 
 @runtime_checkable
 class GoesOnAnew(Printer, Protocol):
-    """A printer whose server prints the job, and takes what is left of it as written anew."""
+    """A printer whose server prints the job and can take a rewritten rest of it."""
 
     def rewrite(self, rest: PrintableProgram, line_of: Int[np.ndarray, " m"]) -> None:
-        """From where the nozzle rests, have this program printed in the place of the job's rest.
+        """Have this program printed, from where the nozzle rests, in place of the job's rest.
 
         Parameters
         ----------
         line_of
-            (m + 1,) by line of the job, and its end: the program's line that stands for it; below
-            0 before what is written anew.
+            (m + 1,) for each line of the job, and for its end, the line of the new program that
+            replaces it; negative for lines before the rewritten part.
         """

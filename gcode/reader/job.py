@@ -1,4 +1,4 @@
-"""`Job`: a program read into layers and beads."""
+"""`Job`: a program of any slicer, read into layers and beads."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ NOTHING_LAID = "The program extrudes nothing; it is no print job."
 
 @dataclass(frozen=True, slots=True)
 class JobLayer:
-    """One layer: lines [first_line, end_line) of the program.
+    """One layer; it is written in lines [first_line, end_line) of the program.
 
     Attributes
     ----------
     z_mm
-        Top of the layer: where the nozzle extrudes.
+        The top of the layer, which is the nozzle's height.
     """
 
     index: int
@@ -57,9 +57,10 @@ class JobLayer:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """Layers [first_layer, end_layer) one above the other, on lines [first_line, end_line).
+    """A stack of layers [first_layer, end_layer), written in lines [first_line, end_line).
 
-    A job that prints its objects one after another has one for each; any other has one.
+    A sequential job, which prints its objects one after another, has a turn for each object; any
+    other job has a single one.
     """
 
     index: int
@@ -101,27 +102,33 @@ class Beads:
         return len(self.line)
 
     def subset(self, pick: Bool[np.ndarray, " n"]) -> Beads:
-        """Some of them, in their order."""
+        """The chosen beads, in their order."""
         per_bead = (f.name for f in fields(self) if f.name != "roles")
         return replace(self, **{name: getattr(self, name)[pick] for name in per_bead})
 
     @property
     def volume_mm3(self) -> float:
-        """Plastic in all beads."""
+        """Volume of plastic in all beads."""
         lengths_mm = np.linalg.norm(self.end_mm - self.start_mm, axis=1)
         return float(lengths_mm @ self.section_mm2)
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A program, read.
+    """A program that has been read.
 
     Attributes
     ----------
+    program
+        Its text and dialect.
+    layers, beads
+        What it lays.
     footer_start_line
-        The line after the last bead: what follows retracts, parks, switches off.
+        The line after the last bead; from there on the program retracts, parks, switches off.
+    filament_diameter_mm, filament_mm
+        The filament's diameter, and the length that is used.
     block
-        All of it: the machine's states, line by line.
+        The machine's state after each line.
     """
 
     program: Program
@@ -140,11 +147,11 @@ class Job:
 
     @property
     def turns(self) -> tuple[Turn, ...]:
-        """In which the job prints what it prints: one, or one for each object after another."""
+        """The turns in which the job prints: one for each object of a sequential job, else one."""
         return turns_of(self.layers)
 
     def turn_at(self, line: int) -> Turn:
-        """The turn that is under way, or has just come to its end, before a line."""
+        """The turn that is under way, or has just ended, before a line."""
         turns = self.turns
         begun = bisect_right([turn.first_line for turn in turns], line - 1)
         return turns[max(begun - 1, 0)]
@@ -158,18 +165,18 @@ class Job:
         return int(self.beads.line[np.searchsorted(self.beads.layer, turn.end_layer) - 1]) + 1
 
     def laid_in(self, turn: Turn) -> Bool[np.ndarray, " n"]:
-        """(n,) which beads one turn lays."""
+        """(n,) which beads belong to a turn."""
         layer = self.beads.layer
         return (layer >= turn.first_layer) & (layer < turn.end_layer)
 
     def of_turn(self, turn: Turn) -> Job:
-        """The same, as if nothing but what one turn lays were laid; its layers keep their index."""
+        """The job with the beads of one turn only; layers keep their numbers."""
         own = self.laid_in(turn)
         return self if own.all() else replace(self, beads=self.beads.subset(own))
 
     @property
     def nozzles(self) -> int:
-        """How many heads are heated by themselves."""
+        """How many separately heated heads the job was read for."""
         return self.block.states.shape[1] - kernels.S_HOT
 
     @property
@@ -225,7 +232,7 @@ def read_job(
     program
         Text of any slicer; for a bare text, `dialect` says whose modes it follows.
     nozzles
-        How many heads the printer has that are heated by themselves.
+        How many separately heated heads the printer has.
 
     Raises
     ------
@@ -329,9 +336,10 @@ def layers_of(
 
 
 def _with_heights(layers: list[JobLayer], comments: list[tuple[int, str]]) -> tuple[JobLayer, ...]:
-    """Heights as the slicer states them; of a layer no higher than the one before, as others are.
+    """Correct the heights of layers that are no higher than the one before.
 
-    The next of objects that are printed one after the other begins as the first one did.
+    Such a layer takes the height that the slicer states, else the usual one. The first layer of a
+    further object in a sequential job is as high as the job's first.
     """
     stated = [
         (line, float(match.group(1)))
@@ -354,10 +362,10 @@ def _with_heights(layers: list[JobLayer], comments: list[tuple[int, str]]) -> tu
 
 
 def turns_of(layers: Sequence[JobLayer]) -> tuple[Turn, ...]:
-    """Layers by the turns that they belong to.
+    """Divide layers into turns.
 
-    A new one begins where a layer is laid at least a layer lower than the one before. Less is a
-    first layer over a raft, that the next one presses down.
+    A new turn begins where a layer lies at least a layer lower than the one before. A smaller step
+    down occurs in the first layer over a raft, which the next one presses down.
     """
     firsts = [0]
     for before, after in pairwise(layers):
@@ -380,7 +388,7 @@ def mark_of(comment: str) -> str | None:
 
 
 def _marks(comments: list[tuple[int, str]]) -> list[int]:
-    """Lines of the slicer's layer marks; one kind of mark only."""
+    """The lines with the slicer's layer marks, all of one kind."""
     by_kind: dict[str, list[int]] = {}
     for line, text in comments:
         kind = mark_of(text)
@@ -393,7 +401,7 @@ def _marks(comments: list[tuple[int, str]]) -> list[int]:
 
 
 def _marks_by_height(end_z_mm: Float[np.ndarray, " n"], owner: Int[np.ndarray, " n"]) -> list[int]:
-    """First lines of runs of beads at one height."""
+    """The first lines of runs of beads at one height."""
     z = np.round(end_z_mm, 4)
     marks = [int(owner[0])]
     current = z[0]
@@ -445,7 +453,10 @@ def _as_high_as_the_rest(
     ironed: Bool[np.ndarray, " n"],
     layer: Int[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """Heights, those of what irons as of what it irons: slicers tell its plastic, spread thin."""
+    """Bead heights, where ironing has the height of the layer that it irons.
+
+    Slicers state a tiny height there, that of the little plastic which ironing spreads.
+    """
     if not ironed.any():
         return height_mm
     tallest_mm = np.zeros(int(layer.max()) + 2)  # the last: before the first layer

@@ -1,7 +1,7 @@
-"""The job's own lines: a patch laid along them is what the job would have printed there.
+"""The job's own lines: a patch that follows them prints what the job would have printed there.
 
-Between lines of one's own drawing and those of the layers around them lie grooves and ridges; a
-staircase on a slope has other steps. Whoever knows what the job lays need not guess.
+Newly drawn lines would leave grooves and ridges against the layers around them, and other steps on
+slopes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ EXACTLY_MM = 0.01  # how exactly it is told which columns lie in a line
 
 @runtime_checkable
 class Spans(Protocol):
-    """What a job spans over air."""
+    """What can say how far a job bridges over air."""
 
     def longest_mm(self) -> float:
         """The longest straight span from hold to hold; 0 where there is none."""
@@ -45,11 +45,11 @@ class JobLines:
     section_mm2, height_mm
         (n,) plastic cross-section, and the layer's height.
     rim
-        (n,) whether it is a perimeter.
+        (n,) whether a line is a perimeter.
     gone_mm
-        (g, 2, 3) stretches of them, from where to where, that were seen not to be there at all.
+        (g, 2, 3) start and end of stretches that were found to be missing altogether.
     bridges
-        What they span over air, as whoever judges the patch will find it; None: nobody knows.
+        What the lines bridge over air, as the checker will judge it; None where that is not known.
     """
 
     start_mm: Float[np.ndarray, "n 3"]
@@ -61,7 +61,7 @@ class JobLines:
     bridges: Spans | None = None
 
     def some(self, which: Bool[np.ndarray, " n"]) -> JobLines:
-        """Some of them."""
+        """The chosen lines."""
         return replace(
             self,
             start_mm=self.start_mm[which],
@@ -72,17 +72,17 @@ class JobLines:
         )
 
     def near(self, low_mm: Float[np.ndarray, " 3"], high_mm: Float[np.ndarray, " 3"]) -> JobLines:
-        """Level lines that pass through a box."""
+        """The horizontal lines that pass through a box."""
         low, high = np.minimum(self.start_mm, self.end_mm), np.maximum(self.start_mm, self.end_mm)
         through = ((high >= low_mm) & (low <= high_mm)).all(axis=1)
         return self.some(through & (high[:, 2] - low[:, 2] < SAME_LEVEL_MM))
 
     def at(self, z_mm: float) -> JobLines:
-        """Those at one height."""
+        """The lines at one height."""
         return self.some(np.abs(self.end_mm[:, 2] - z_mm) < SAME_LEVEL_MM)
 
     def chains(self) -> list[tuple[Bead, Float[np.ndarray, " _m"]]]:
-        """Lines that go on from one another as one bead, and the sections of its pieces."""
+        """Consecutive lines joined to beads, each with the cross-sections of its pieces."""
         n = len(self.rim)
         if n == 0:
             return []
@@ -103,15 +103,15 @@ class JobColumns:
     Parameters
     ----------
     lines
-        Of the job.
+        The job's lines.
     asked
-        Columns that something is missing in; their neighbours are asked about as well.
+        Columns in which something is missing; those within `rim_mm` of them are included.
     points_mm
-        (ny · nx, 2) their middles.
+        (ny · nx, 2) middles of all columns.
     low_mm, high_mm
-        Heights between which they are asked about.
+        The heights that matter.
     rim_mm
-        Neighbours are so near.
+        How far around the asked columns others are included.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class JobColumns:
         return self._lines.at(z_mm)
 
     def at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"] | None:
-        """Columns that lines at one height lie over; None where the job has none there."""
+        """The columns under lines at one height; None where the job has no line there."""
         key = round(z_mm, 4)
         if key not in self._masks:
             self._masks[key] = self._over(self.lines_at(z_mm))
@@ -161,7 +161,7 @@ class JobColumns:
     def laid_mm(
         self, from_mm: Float[np.ndarray, "ny nx"], to_mm: float
     ) -> Float[np.ndarray, "ny nx"]:
-        """How much of each column, from a height of its own to one of all, the job filled."""
+        """How much of each column the job filled, from the column's own height to a common one."""
         laid = np.zeros(self.near.shape)
         for top_mm, height_mm in self._layers:
             over = self.at(top_mm) if top_mm < to_mm + SAME_LEVEL_MM else None
@@ -183,20 +183,20 @@ class JobColumns:
 
 @dataclass(frozen=True, slots=True)
 class JobPieces:
-    """What the job laid in each piece of some runs.
+    """What the job laid where the pieces of some beads lie.
 
     Attributes
     ----------
     section_mm2
-        (n,) cross-section.
+        (n,) the job's cross-section there.
     height_mm
-        Of their layer.
+        The layer's height.
     half_mm
-        Half their width.
+        Half the lines' width.
     gone
-        (n,) seen not to be there at all.
+        (n,) whether the job's line was found to be missing altogether.
     over
-        Columns that the job's lines lie over, whether something is missing there or not.
+        The columns under the job's lines, whether something is missing there or not.
     """
 
     section_mm2: Float[np.ndarray, " n"]
@@ -215,22 +215,25 @@ def gathered(
     width_mm: float,
     options: JobLineOptions = USUAL_PATCH.lines,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """What is missing, piece by piece of the job's lines, a little beside a lot given to the lot.
+    """How much to lay in each piece of the job's lines.
+
+    A scan blurs: from a missing line it takes some volume and gives it to the lines beside it. So
+    pieces that lack a little hand it over to a piece near by that lacks a lot.
 
     Parameters
     ----------
     volume_mm3, deep_mm
-        (n,) missing, as the scan told it, and how deep on average where it is.
+        (n,) missing volume in each piece, as the scan tells it, and its mean depth.
     job
-        What lay there: no piece is given more than that, on as deep a floor, and what was seen to
-        be gone gets no less where it stands out from what is around it.
+        What the job laid there. No piece gets more than that (on a deeper floor, in proportion);
+        a piece of a missing line gets no less, where it stands out from those around it.
     length_mm, middle_mm
-        (n,) and (n, 2) of the pieces.
+        (n,) length and (n, 2) middle of each piece.
 
     Returns
     -------
-    (n,) what to lay in each piece, and (n,) how much of what was told of it is laid by that, there
-    or in the pieces that it was given to.
+    (n,) the volume to lay in each piece; and (n,) how much of each piece's missing volume is laid,
+    there or in the piece that it was handed to.
     """
     own_mm3 = np.maximum(job.section_mm2 * length_mm, 1e-9)
     most_mm3 = own_mm3 * np.maximum(1.0, deep_mm / job.height_mm)
@@ -252,7 +255,7 @@ def gathered(
                 volume[other] += moved
                 volume[k] -= moved
             if gone[near].any():
-                volume[k] = 0.0  # it was the gone line's own, which has it already
+                volume[k] = 0.0  # it belongs to the missing line, which is given all of its plastic
     dropped = volume < options.nothing * own_mm3
     return np.where(dropped, 0.0, volume), volume_mm3 - np.where(dropped, volume, 0.0)
 
@@ -264,10 +267,10 @@ def _rounded_off(
     around_mm: float,
     options: JobLineOptions,
 ) -> Bool[np.ndarray, " q"]:
-    """Which of some pieces lack all of a line, though they read as if they lacked less.
+    """(q,) which pieces lack all of a line though the scan, blurred, shows them to lack less.
 
-    A spot takes from a line that is gone and gives to its neighbours. Where all around lacks as
-    much there is nothing to round off: thin lines, not gone ones.
+    They must lack nearly all, or clearly more than the pieces around them. Where all around lacks
+    as much, lines are thin rather than missing.
     """
     tree = cKDTree(middle_mm)
     near = tree.query_ball_point(middle_mm[asked], around_mm)
@@ -280,9 +283,9 @@ def runs_of(
     over: Bool[np.ndarray, "ny nx"],
     cut: Callable[[Bead], list[Bead]],
 ) -> tuple[list[Bead], JobPieces]:
-    """Lines as beads, cut into runs by `cut`, and what the job laid in the runs' pieces.
+    """The job's lines as beads, cut into runs, and what the job laid in the pieces of those runs.
 
-    `over` are the columns that the lines lie over.
+    `cut` divides a bead into the runs that can be laid; `over` are the columns under the lines.
     """
     runs: list[Bead] = []
     places, sections = [np.zeros((0, 2))], [np.zeros(0)]
@@ -306,7 +309,7 @@ def runs_of(
 def _on_any(
     points_mm: Float[np.ndarray, "p 2"], stretches_mm: Float[np.ndarray, "g 2 2"]
 ) -> Bool[np.ndarray, " p"]:
-    """Which points lie on any of some stretches; each asks those in its box alone."""
+    """(p,) which points lie on any of some stretches; only points in a stretch's box are tested."""
     found = np.zeros(len(points_mm), dtype=bool)
     order = np.argsort(points_mm[:, 0])
     x_mm, y_mm = points_mm[order].T
@@ -324,7 +327,7 @@ def _on(
     a_mm: Float[np.ndarray, " 2"],
     b_mm: Float[np.ndarray, " 2"],
 ) -> Bool[np.ndarray, " p"]:
-    """Which points lie on a stretch."""
+    """(p,) which points lie on a stretch."""
     along = b_mm - a_mm
     t = (points_mm - a_mm) @ along / max(float(along @ along), 1e-12)
     off = points_mm - a_mm - t[:, None] * along
@@ -334,7 +337,7 @@ def _on(
 def _piece_of(
     points_mm: Float[np.ndarray, "p 2"], bead: Bead, tree: cKDTree
 ) -> Int[np.ndarray, " p"]:
-    """Which piece of a bead each point lies on, among those whose middles are nearest."""
+    """(p,) the piece of a bead that each point lies on, of those with the nearest middles."""
     m = len(bead.xy_mm) - 1
     if m == 1:
         return np.zeros(len(points_mm), dtype=np.int64)

@@ -1,6 +1,7 @@
-"""How parts and patches are planned: each number once. Bores are the printer's, layers the job's.
+"""Options of slicing: how parts and patches are planned, each number once.
 
-What keeps the head clear of what stands there is not among them: those limits are the checker's.
+Bores come from the printer's profile and layers from the job. How far the head must keep clear of
+what stands there is not among these options: those limits are the checker's.
 """
 
 from __future__ import annotations
@@ -10,30 +11,30 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class ColumnOptions:
-    """Columns over a deficit.
+    """The columns over a deficit on which a patch is planned.
 
     Attributes
     ----------
     fine_mm, coarse_mm, fine_cells
-        Edge of a column; the second where there were more than so many of the first.
+        Edge of a column. Columns are coarse where there would be more than `fine_cells` fine ones.
     margin_mm
-        Around the deficit.
+        Margin around the deficit.
     tip_cells
-        Places of the tip in a column of the as-built field, each way.
+        How many places of the tip are asked about in a column of the as-built field, each way.
     most_thick_nozzles
-        A bead thicker than this share of the bore no longer presses onto its floor.
+        The thickest bead, in bores: a thicker one no longer presses onto its floor.
     drop_nozzles
-        In bores: a strand that nothing holds falls as far as this onto a floor, as one purged in
-        the air does, and lies where it was laid. Deeper down it is anybody's guess.
+        How far, in bores, an unsupported strand may fall onto a floor and still lie where it was
+        laid, as one purged in the air does. From higher up nobody knows where it comes to lie.
     spread_nozzles
-        From a bead's centre, as far as plastic is pressed sideways under the nozzle's flat, which
-        is 2.5 bores across (E3D V6): not to its very rim.
+        How far, in bores, plastic is pressed sideways from a bead's centre under the nozzle's flat.
+        That is 2.5 bores across (E3D V6), and plastic does not reach its very rim.
     seam_mm
-        Around a loop's seam, as far as old material hides it.
+        How far around a loop's seam old material hides it.
     job_layer_mm
-        A job's layer may end so far above the deficit that it belongs to.
+        How far above the deficit a layer of the job may end that still belongs to it.
     no_lift_mm
-        A travel as short as this needs no lift.
+        A travel no longer than this needs no lift.
     """
 
     fine_mm: float = 0.1
@@ -51,22 +52,24 @@ class ColumnOptions:
 
 @dataclass(frozen=True, slots=True)
 class PassHeightOptions:
-    """Heights of passes.
+    """The heights at which passes are laid.
 
     Attributes
     ----------
     deep_ratio
-        A gap of more than this share of the thickest bead is not filled from above: up to there a
-        strand of one line width, round (π/4 d² = width × gap), still reaches its floor. On a steep
+        A gap deeper than this many times the thickest bead is not filled from above. Up to there a
+        round strand of one line width (π/4 d² = width × gap) still reaches its floor. On a steep
         slope the head keeps the tip this far off.
     opening_mm2, opens_below_mm
-        Of columns over a hollow, as many as open to the head at one height are worth a pass there;
-        over less of a hollow than half a layer the last pass goes anyway.
+        An extra pass is laid at a height where the head first gets into this area of hollows.
+        Columns count only from `opens_below_mm` below their top on, half a layer: the last pass
+        goes over the others anyway.
     apart_layers
-        What hangs spreads to both sides of its line, held there or not, and a strand that is drawn
-        just above it finds no room.
+        The least distance of passes above hanging strands, in layers: a strand spreads, and one
+        that is drawn just above it finds no room.
     flat_mm2, flat_wide_mm, flat_mm, on_flat_mm
-        A flat top: as much area, as wide, within so little height; and what belongs to it.
+        A top is flat if it has this area and this width within `flat_mm` of height; columns within
+        `on_flat_mm` of it belong to it.
     """
 
     deep_ratio: float = 1.6
@@ -81,23 +84,25 @@ class PassHeightOptions:
 
 @dataclass(frozen=True, slots=True)
 class DueOptions:
-    """What is to be laid at one height.
+    """Where beads are due in a pass.
 
     Attributes
     ----------
     agree_mm
-        The floor was measured, the deficit computed from it: they agree within this.
+        The measured floor and the deficit that was computed from it agree within this.
     rounded_off_mm
-        More than the mean of a scan's noise.
+        Along the job's lines, gaps from this thickness on are due where something is missing: it is
+        more than the mean of a scan's noise, and the shallow rim that a scan rounds off counts.
     hold_mm
-        A line's width: how far a bead may hang over a hole beside what holds it.
+        How far a bead may hang over a hole beside what holds it: a line's width.
     hem_mm, rim_mm2
-        From a tip in the air, as far as its bead covers a rim; less of one is not worth a line.
+        How far from a tip over air its bead still covers a rim, and the least area of a rim that is
+        worth such a line.
     most_hem
-        Of the plastic, what may be laid in the air beside rims; about twice as much lies outside
-        then.
+        The largest share of plastic that may be laid over air beside rims; about twice that share
+        then lies outside the deficit.
     filled_enough
-        Of what the head allows: a way that fills as much leaves little for others to find.
+        A plan that fills this share of what the head can reach is good enough: no other is tried.
     """
 
     agree_mm: float = 0.04
@@ -111,26 +116,28 @@ class DueOptions:
 
 @dataclass(frozen=True, slots=True)
 class BridgeOptions:
-    """Strands over air, held at both ends; how long they may be is the material's.
+    """Bridges: strands over air, held at both ends. The material says how long they may be.
 
     Attributes
     ----------
     hold_mm
-        A line's width: as far a strand goes on over what holds its end (as PrusaSlicer's anchors).
+        How far a strand goes on over what holds its end (PrusaSlicer's anchors): a line's width.
     loose_mm
-        Over so much of a span nothing may be wanted: a scan rounds off the rims of what holds.
+        Over how much of a span nothing needs to be missing, since a scan rounds off the rims of
+        what holds.
     least_layers
-        A strand thinner than this share of a layer is drawn out, not laid: the next pass spans it.
+        A strand thinner than this many layers would be drawn out; it is left to the next pass.
     least_mm2
-        Less of a hollow is not worth a strand: what hangs beside its rim closes it.
+        A smaller hollow gets no strand: beads that hang beside its rim close it.
     beside_mm
-        Of the job's own lines: nearer than this to what is as high they are held from beside.
+        A line of the job is held from beside by what is as high and no farther away than this.
     beside_layers
-        What ends no more than so much of a layer below the tip is as high.
+        What ends no more than this many layers below the tip counts as being as high.
     pressed_mm
-        The same of lines of our own, which are pressed against those beside them.
+        As `beside_mm`, for newly drawn lines, which are pressed against those beside them.
     alike
-        Angles whose strands span the same but for this share: the shorter ones are laid.
+        Directions that span the same area to this share count as equal; of those the one with the
+        shorter strands is chosen.
     """
 
     hold_mm: float = 0.45
@@ -145,26 +152,25 @@ class BridgeOptions:
 
 @dataclass(frozen=True, slots=True)
 class BeadOptions:
-    """Beads of a pass.
+    """The beads of a pass.
 
     Attributes
     ----------
     bond_ratio
-        A patch presses into pores and roughness that no scan resolves, and printers push a per cent
-        less than they are asked to: what is too little stays a void, what is too much is planed.
-    least_thick_mm
-        Thinner than this no bead holds together; it is filled with the next pass, or is the
-        tolerance.
-    least_section_mm2
-        Nor one with less plastic.
+        Factor on all plastic of a patch: it presses into pores that no scan resolves, and printers
+        push a per cent less than they are asked to. Too little would stay a void, while too much is
+        flattened by the nozzle.
+    least_thick_mm, least_section_mm2
+        No thinner bead, and none of less plastic, holds together. What would need one is filled
+        with the next pass, or is within tolerance.
     to_wall_mm
-        What is pressed out under the flat beside a wall goes on to the wall, where that is this
-        near to what it reaches: nowhere else has it to go.
+        Plastic that is pressed out beside a wall reaches the wall where the gap is no wider than
+        this.
     drawn_mm
-        Centre lines keep off the rim of where the tip may go: outlines round off the corners of its
-        cells, by about so much.
+        How far centre lines keep off the rim of where the tip may go, since outlines round off the
+        corners of its cells by about so much.
     on_line_mm
-        From a job's line to what it covers.
+        How far from a job's line a column may lie that the line covers.
     """
 
     bond_ratio: float = 1.015
@@ -177,25 +183,27 @@ class BeadOptions:
 
 @dataclass(frozen=True, slots=True)
 class JobLineOptions:
-    """Along the job's own lines.
+    """How a patch follows the job's own lines.
 
     Attributes
     ----------
     rim_mm
-        Beside the deficit's columns: its rim is as uncertain as the scan's noise and spacing make
-        it.
+        How far around the deficit lines are followed: its rim is as uncertain as the scan's noise
+        and spacing make it.
     lot, little, nothing
-        A scanner's spot rounds off what is gone: a little beside a lot is the lot's own. Shares of
-        what the job lays in a piece of a line: from here on it lacks a lot, up to there a little,
-        and less is nothing.
+        A scan blurs, so what a piece of a line lacks a little of belongs to a piece near by that
+        lacks a lot. A piece lacks a lot from `lot` of its plastic on, a little below `little`, and
+        nothing below `nothing`.
     nearly_all, stands_out
-        Shares that a line which is gone reads, at least, and more than what is around it.
+        A missing line lacks at least `nearly_all` of its plastic, or `stands_out` more than what is
+        around it.
     beside_widths
-        From a line to its neighbour.
-    least_of_gap, served
-        Where the gap is more than the deficit, both are right to about this share. And the share
-        of what is due from which on the job's lines serve; where they serve less, others may serve
-        more.
+        How far, in line widths, a neighbouring line may be.
+    least_of_gap
+        Where the gap under a line is larger than the deficit, both count as right to this share.
+    served
+        The job's lines are followed if they fill this share of what is due; if they fill less,
+        newly drawn lines are tried, and may be better.
     """
 
     rim_mm: float = 0.3
@@ -216,14 +224,14 @@ class SkinOptions:
     Attributes
     ----------
     thick_mm, least_mm
-        About as thick as it gets; and what is left to it everywhere.
+        About how thick the pass is at most, and how much planar passes leave to it everywhere.
     most_rise_mm
-        The tip may stay this far over the surface for the sake of what is uphill: farther, and it
-        no longer presses the bead down. With a flat of 1 mm that is a slope of 14 degrees.
+        How far above the surface the tip may be kept by what is uphill: farther up it would no
+        longer press the bead down. With a flat of 1 mm this is a slope of 14 degrees.
     least_slope, least_climb_mm
-        Rise over run, and from its lowest to its highest: flatter is flat, whatever its noise.
+        A surface flatter than this (rise over run), or that climbs less in all, is flat.
     mm2, wide_mm
-        As large, and as wide.
+        Least area and width of such a surface.
     """
 
     thick_mm: float = 0.2
@@ -237,19 +245,20 @@ class SkinOptions:
 
 @dataclass(frozen=True, slots=True)
 class LeftOptions:
-    """What a patch leaves, and is told with its cause.
+    """What a patch leaves open, which is told with its cause.
 
     Attributes
     ----------
     least_share, least_worth_mm3, least_closed
-        Less of a hollow than this share, so little, and over less of its opening: it closes
-        nothing.
+        Beads in a hollow are dropped if they fill less than this share of it, less than this
+        volume, and close less than this share of its opening.
     staircase_mm
-        Of a job's staircase: half a layer, and what the scan gets wrong.
+        Columns that end within this below the deficit's top are only the steps of the job's slopes:
+        half a layer, and the scan's error.
     least_cause
-        Of what is left of a piece: a cause of less is told with the greatest.
+        A cause of less than this share of what is left of a piece is told with the greatest cause.
     least_listed_mm3
-        Less is not told.
+        A smaller volume is not told.
     """
 
     least_share: float = 0.1
@@ -267,19 +276,21 @@ class FillOptions:
     Attributes
     ----------
     least_nozzles, most_nozzles
-        Widths of a bead, in bores: a thinner one is not drawn out evenly, a wider one does not
-        reach its edges from under the nozzle's flat (Kuipers et al. 2020, Arachne, section 3).
+        Least and greatest width of a bead, in bores: a thinner one is not drawn out evenly, and
+        the plastic of a wider one does not reach its edges from under the nozzle's flat (Kuipers et
+        al. 2020, Arachne, section 3).
     flow_span
-        Weighing may change flow so far; beyond that the geometry is wrong.
+        By which factors the flow of beads may be changed to fill the area exactly; beyond these the
+        geometry is wrong.
     connect_spacings
-        Ends of lines that are no farther apart are joined by a stroke.
+        Ends of lines no farther apart than this many spacings are joined.
     facing_ratio
-        Feet farther apart than this many radii: walls that meet at less than 97 degrees face each
-        other, and an axis runs between them.
+        Two walls face each other, with an axis between them, if their feet are farther apart than
+        this many radii: the walls then meet at less than 97 degrees.
     end_inset_ratio
-        Of the radius: an open bead ends so far short of its wall, its round cap fills the rest.
+        How far an open bead ends short of its wall, in radii; its round cap fills the rest.
     dot_inside_ratio
-        A stroke that fills a dot lies in it with at least this share of its area.
+        At least this share of a stroke that fills a dot lies in the dot.
     """
 
     least_nozzles: float = 0.5
@@ -302,25 +313,27 @@ class PartOptions:
     Attributes
     ----------
     fill
-        Beads of an area.
+        How areas are filled with beads.
     overlap_ratio
-        Of a spacing, how far fills reach into walls: PrusaSlicer's default.
+        How far fills reach into walls, in spacings; PrusaSlicer's default.
     dense_ratio
-        Infill is solid from here on.
+        From this density on infill counts as solid.
     flow_correction
-        A slab's volume over its section times its height: outside of this, flow would be wrong.
+        The flow of a layer is corrected by its volume over section times height; outside of this
+        range that would be wrong.
     least_left_mm3
-        Less of what no bead can make is not told.
+        A smaller volume that no bead can fill is not told.
     highest_nozzles
-        In bores: higher layers no longer press onto the last.
+        The highest layer, in bores: a higher one no longer presses onto the last.
     snap_share
-        Horizontal faces above this share of the largest section bend the layers' heights.
+        Layer heights are adapted to horizontal faces larger than this share of the largest section.
     short_travel_mm
-        Oozing costs less than a retraction below this.
+        On shorter travels oozing costs less than a retraction.
     corner_rad
-        Turns sharper than this hide a seam.
+        A turn sharper than this hides a seam.
     inward_mm, other_mm
-        What a corner is worth: an inward one hides the seam wherever on the loop it is.
+        How far away a seam may be put for the sake of a corner: an inward one hides the seam
+        wherever on the loop it is.
     """
 
     fill: FillOptions = field(default_factory=FillOptions)
@@ -337,12 +350,12 @@ class PartOptions:
 
 
 USUAL_PART = PartOptions()
-"""What parts are sliced by."""
+"""The default for parts."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatchOptions:
-    """Settings of a patch; its plan records those it was made with."""
+    """Settings of a patch; its plan records those that were used."""
 
     columns: ColumnOptions = field(default_factory=ColumnOptions)
     heights: PassHeightOptions = field(default_factory=PassHeightOptions)
@@ -356,4 +369,4 @@ class PatchOptions:
 
 
 USUAL_PATCH = PatchOptions()
-"""What repairs go by."""
+"""The default for repairs."""

@@ -1,9 +1,12 @@
 """A patch: beads that fill a deficit on top of a rough floor, and nothing else.
 
-Passes lie on the job's own layers, from the floor up. At every place a bead is as thick as the gap
-between its nozzle and the surface predicted after the earlier passes, and
-a place is filled when waiting for the next layer would leave a gap too deep for one bead. What the
-nozzle cannot reach, and what is too thin for it, is listed with its volume.
+The deficit is divided into vertical columns on a fine grid (`patch_model`). Passes are laid from
+the floor up, on the job's own layers (`patch_heights`), and after each of them the surface of the
+columns is predicted anew (`patch_state`). A pass lays a bead wherever waiting for the next pass
+would leave a gap too deep for one bead (`patch_due`); the bead is as thick as the gap between the
+nozzle and the surface predicted there. Several ways to plan the passes are tried, and the best is
+kept (`patch_plan`). What the nozzle cannot reach, and what is too thin for a bead, is listed with
+its volume (`patch_left`).
 """
 
 from __future__ import annotations
@@ -49,20 +52,26 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class PatchPlan:
-    """A patch and what it leaves out.
+    """A patch, and what it leaves out.
 
     Attributes
     ----------
+    toolpath
+        The moves; empty where nothing can be laid.
     beads_mm3
-        Plastic laid as beads.
+        Volume of plastic in the beads.
     reachable_mm3
-        Volume of the deficit that the nozzle gets to.
+        Volume of the deficit that the nozzle reaches.
+    unreachable, unprintable
+        Pieces that the nozzle cannot reach, and pieces into which no bead fits.
+    regions
+        For each connected piece of the deficit, how much of it is filled.
     first_pass
-        How the first pass is laid onto what has long been cold, in words.
+        How the first pass is laid onto cold plastic, in words.
     left
-        Columns that stay open, by cause: where, and from which height to which.
+        The columns that stay open, by cause, each from which height to which.
     options
-        That it was planned with.
+        The options that were used.
     """
 
     toolpath: Toolpath
@@ -89,27 +98,29 @@ def slice_patch(
     options: PatchOptions = USUAL_PATCH,
     progress: Progress = silent,
 ) -> PatchPlan:
-    """Slice a deficit.
+    """Slice a deficit into beads that fill it.
 
     Parameters
     ----------
     deficit
         `manifold3d.Manifold` of what is missing, build frame, mm.
     as_built
-        What stands there, where unseen as high as is safe.
+        The heights of what stands there; unseen places must be as high as is safe.
     grid
-        Layers of the job.
+        The job's layers.
     standalone
-        True: a whole program for a part that stands on a machine whose Z is still true: X and Y
-        are homed, Z never. False: in mid-job, hot, parked at `start_mm` with the filament pulled
-        back by the profile's retraction; the patch ends there likewise. Nothing is primed then:
-        what else stands on the plate, where that would be, is not in `as_built`.
+        True makes a whole program for a part on a machine whose Z is still true; X and Y are
+        homed, Z never. False makes a patch in mid-job: the machine is hot and parked at `start_mm`
+        with the filament pulled back by the profile's retraction, and is left in the same state.
+        Nothing is primed then, since `as_built` does not show what else stands on the plate.
+    start_mm
+        Where the nozzle is parked in mid-job.
     hotend_c
-        What the job prints at; None: what the material is printed at. The first pass is hotter by
-        the material's `repair_first_bead_delta_c`.
+        The job's nozzle temperature; None takes the material's. The first pass is hotter by the
+        material's `repair_first_bead_delta_c`.
     lines
-        What the job laid there, where that is known: the patch follows it, step by step of its
-        staircase, with as much of each line's plastic as is missing.
+        The lines that the job laid there, where they are known. The patch follows them, in the same
+        steps on slopes, with as much of each line's plastic as is missing.
     options
         How passes and beads are planned.
 
@@ -173,7 +184,7 @@ def slice_patch(
 def _without(
     found: PatchPasses, dropped: Bool[np.ndarray, "ny nx"], model: PatchModel
 ) -> PatchPasses:
-    """Without the beads over some columns."""
+    """The same passes without the beads over some columns."""
     if not dropped.any():
         return found
     kept = []

@@ -1,4 +1,4 @@
-"""What is due at one height of a patch: how thick, column by column, and over what it hangs."""
+"""What is due in a pass: how thick each column is to be filled, and where beads would hang."""
 
 from __future__ import annotations
 
@@ -17,11 +17,24 @@ from gcode.slicing.patch_state import PatchState
 
 @dataclass(frozen=True, slots=True)
 class Due:
-    """Thickness to lay by column, what is given up below where it is laid, and where in the air.
+    """What is due in a pass, column by column.
 
-    What `hangs` is as high as the nozzle once it is laid, whatever lies open below; `bridges` sag.
-    What is `loose` fell onto the floor: it fills, but holds nothing. What is `alone` no line of our
-    own would be held over, the job's might.
+    Attributes
+    ----------
+    thick_mm
+        The thickness to lay.
+    sunk_mm
+        The thickness that is given up below, where beads hang over it.
+    hem
+        Columns to be laid over air, beside a rim.
+    hangs
+        Columns where beads hang: once laid they are as high as the nozzle, with a gap below.
+    loose
+        Columns where beads fall onto the floor: they fill it, but hold no strand.
+    bridges
+        Strands over air, which sag.
+    alone
+        Columns over which no newly drawn line would be held, though one of the job's might be.
     """
 
     thick_mm: Float[np.ndarray, "ny nx"]
@@ -34,11 +47,11 @@ class Due:
 
 
 def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
-    """Thickness to lay by column now: the gap, where waiting would make it too deep for a bead.
+    """What is due where the job has no lines: each gap that the next pass would find too deep.
 
-    Where it is too deep already (the nozzle could not get down there), a layer is drawn over it:
-    where strands span it between two holds, and else as far as a bead holds on to what is beside,
-    or falls onto the floor. What lies under it is lost, and said.
+    A gap that is too deep already, since the nozzle could not get down into it, is covered by a
+    layer: by strands from hold to hold, or as far as a bead holds on to what is beside it, or by
+    beads that fall onto the floor. What stays open below is given up, and told.
     """
     options = model.options
     below = model.wanted_below(at.z_mm)
@@ -68,13 +81,13 @@ def due_at(model: PatchModel, state: PatchState, at: Height) -> Due:
 def _ends_hold(
     model: PatchModel, state: PatchState, at: Height, over_mm: Float[np.ndarray, "ny nx"]
 ) -> Bool[np.ndarray, "ny nx"]:
-    """Where what is under the tip is about as high as a layer, and has not fallen there."""
+    """Columns that hold a strand's end: about a layer below the tip, and not fallen there."""
     high = (over_mm <= at.most_mm) & (over_mm >= -model.options.due.agree_mm)
     return high & state.firm_at(at.z_mm)
 
 
 def _bridged(due: Due, bridges: Bridges, thick: Float[np.ndarray, "ny nx"], at: Height) -> Due:
-    """With strands over air: they take the place of what hangs or falls there."""
+    """What is due, with strands over air in the place of beads that would hang or fall."""
     lidded = np.where(thick > at.most_mm, at.layer_mm, thick)
     return replace(
         due,
@@ -88,10 +101,10 @@ def _bridged(due: Due, bridges: Bridges, thick: Float[np.ndarray, "ny nx"], at: 
 def due_of_job(
     model: PatchModel, state: PatchState, at: Height, planned: Bool[np.ndarray, "ny nx"]
 ) -> Due:
-    """Thickness to lay now where the job laid something at this height: up to it, as the job did.
+    """What is due where the job laid lines at this height: up to it, as far as the job filled.
 
-    On a slope the job's steps are what was there, not the smooth surface that the deficit has. What
-    the job left open, as the cells of sparse infill, stays so: a line over it hangs, as it did.
+    On a slope the job's steps were there, and not the smooth surface that the deficit has. What the
+    job left open stays open, as the cells of sparse infill: a line over them hangs, as it did.
     """
     options = model.options
     assert model.job is not None

@@ -1,4 +1,7 @@
-"""The heights of a patch's passes: the job's layers, flat tops, and where the head gets in."""
+"""The heights of a patch's passes: the job's layers, flat tops, and openings of hollows.
+
+An opening is a height between layers at which the head first gets down into a hollow.
+"""
 
 from __future__ import annotations
 
@@ -17,32 +20,32 @@ from gcode.slicing.patch_state import PatchState
 
 
 class Openings(enum.Enum):
-    """Which heights between the job's layers get a pass, where the head first gets into hollows."""
+    """How openings are used: at which heights between the job's layers an extra pass is laid."""
 
     EACH = enum.auto()
-    """From the lowest up, a layer after the other, as long as it gets in over more."""
+    """From the lowest up, layer by layer, for as long as the head gets into more columns."""
     ALONE = enum.auto()
-    """The same, and no pass of the job's in hollows until the last of them."""
+    """The same, and hollows get no pass at the job's layers until the last of these."""
 
 
 @dataclass(frozen=True, slots=True)
 class Height:
-    """One height of passes.
+    """One height, at which a pass is laid.
 
     Attributes
     ----------
     z_mm, index
-        Of the tip, and its number from below.
+        The height of the tip, and its number, counted from below.
     here
-        Columns that are filled at it.
+        Columns that may be filled in this pass.
     following_mm
-        Where each column's next pass is.
+        The height of each column's next pass.
     most_mm, deep_mm
         The thickest bead, and the deepest gap that is filled from above.
     layer_mm
-        Of the job.
+        The height of the job's layers.
     reach
-        Where the tip may be, on the cells of `Reach`.
+        Where the tip may be at this height, on the cells of `Reach`.
     """
 
     z_mm: float
@@ -57,9 +60,18 @@ class Height:
 
 @dataclass(frozen=True, slots=True)
 class Heights:
-    """All heights of a patch, from the floor up; `ends` is where flat tops end their columns.
+    """All heights of a patch's passes.
 
-    Columns `alone` have openings of their own and, up to the last of these, nothing else.
+    Attributes
+    ----------
+    tops_mm, flats_mm, openings_mm
+        Heights of the job's layers, of flat tops between them, and of openings.
+    alone
+        Columns that get passes at openings only, up to the last of these.
+    ends_mm
+        Where a flat top off the job's layers ends a column; infinite elsewhere.
+    most_mm, layer_mm
+        The thickest bead, and the height of the job's layers.
     """
 
     tops_mm: Float[np.ndarray, " n"]
@@ -74,7 +86,7 @@ class Heights:
     def of(
         cls, model: PatchModel, grid: LayerGrid, setup: PrintSetup, *, openings: Openings
     ) -> Heights:
-        """Of a patch: the job's layers, flat tops, and such openings."""
+        """Find the heights for a patch."""
         low_mm, high_mm = float(model.box[2]), float(model.box[5])
         tops = grid.tops_to(high_mm)
         tops = tops[tops > low_mm + 1e-6]
@@ -98,11 +110,11 @@ class Heights:
 
     @property
     def all_mm(self) -> Float[np.ndarray, " n"]:
-        """From the floor up."""
+        """All heights, from the floor up."""
         return np.sort(np.concatenate([self.tops_mm, self.flats_mm, self.openings_mm]))
 
     def at(self, index: int, state: PatchState, model: PatchModel) -> Height:
-        """One of them, when so much has been laid."""
+        """One of the heights, with the columns that may be filled in a given state."""
         options = model.options.heights
         z_mm = float(self.all_mm[index])
         on_grid = not (np.abs(self.flats_mm - z_mm) < ROUNDING_MM).any()

@@ -1,4 +1,4 @@
-"""What a patch leaves out, piece by piece: why, and how much for each cause."""
+"""What a patch leaves open, piece by piece, and how much of it for each cause."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ class LeftColumns:
     Attributes
     ----------
     middle_mm
-        (n, 2) of each, build frame; `cell_mm` is the edge of all.
+        (n, 2) the columns' middles, build frame; `cell_mm` is their edge.
     low_mm, high_mm
-        (n,) from where to where nothing fills it, build frame: over what is laid, or under what
-        hangs over it.
+        (n,) from which height to which a column stays open, build frame: above what is laid in it,
+        or below a strand that hangs over it.
     """
 
     cause: LeftCause
@@ -62,15 +62,22 @@ class LeftColumns:
 
     @property
     def volume_mm3(self) -> float:
-        """As columns have it."""
+        """The open volume, as the columns sample it."""
         return float((self.high_mm - self.low_mm).sum()) * self.cell_mm**2
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOver:
-    """What the head cannot get to, what no bead is laid for, and the pieces of the deficit.
+    """All that a patch leaves open.
 
-    And where that is, column by column.
+    Attributes
+    ----------
+    unreachable, unprintable
+        What the head cannot reach, and what no bead is laid for.
+    regions
+        The connected pieces of the deficit, with the share of each that is filled.
+    columns
+        Where it is, column by column.
     """
 
     unreachable: tuple[Unfilled, ...]
@@ -80,7 +87,7 @@ class LeftOver:
 
 
 def not_worth_it(state: PatchState, model: PatchModel) -> Bool[np.ndarray, "ny nx"]:
-    """Columns of hollows that would stay open: no repair, but strands along a rim."""
+    """Columns of hollows of which so little would be filled that it is no repair at all."""
     options = model.options.left
     wanted = np.isfinite(model.top_mm)
     label, count = ndimage.label(wanted, np.ones((3, 3)))
@@ -103,15 +110,15 @@ def not_worth_it(state: PatchState, model: PatchModel) -> Bool[np.ndarray, "ny n
 def left_over(
     state: PatchState, model: PatchModel, given_up: Bool[np.ndarray, "ny nx"]
 ) -> LeftOver:
-    """By connected piece: what was filled, and why the rest was not."""
+    """Say for each connected piece how much was filled, and why the rest was not."""
     options = model.options
     cell_mm2 = model.cell_mm**2 * model.weight
     wanted = model.wanted_below(np.inf)
     left = np.clip(wanted - state.laid_mm, 0.0, None)
     # a film below the thinnest bead is the tolerance, not out of reach
     left = np.where(left > options.beads.least_thick_mm + options.due.agree_mm, left, 0.0)
-    # nor is what lies under a step of the job's staircase, or over it; what was given up under a
-    # line that hangs is
+    # the same holds for what lies under or over a step of the job's slopes; but what was given up
+    # under a hanging line counts
     done = (state.surface_mm >= state.done_mm - options.due.agree_mm) & (
         state.done_mm > model.top_mm - options.left.staircase_mm
     )

@@ -1,4 +1,4 @@
-"""What a patch is planned on: columns over a deficit, and where the head may be over them."""
+"""The model of a patch: columns over a deficit, and where the tool head may be over them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gcode.surfaces import raster_kernels as kernels
 
 
 class PatchModel:
-    """Columns over the deficit: what is wanted, what is there, where the tip may go."""
+    """Columns on a fine grid: what is missing in each, what stands there, where the tip may go."""
 
     def __init__(
         self,
@@ -55,14 +55,14 @@ class PatchModel:
         self.points_mm = self._centres()
         floor_mm = as_built.sample(self.points_mm).reshape(self.shape)
         self.floor_mm = floor_mm
-        # where a tip may lay what is missing: over it, or in the air beside a rim
+        # columns on which beads may be laid: over what is missing, or over air beside its rim
         away_mm = ndimage.distance_transform_edt(~np.isfinite(self.top_mm)) * self.cell_mm
         self.near = np.asarray(away_mm <= options.columns.no_lift_mm)
         self.beside_mm = ndimage.uniform_filter(
             floor_mm, round(2 * options.columns.seam_mm / self.cell_mm) + 1
         )
         self.job: JobColumns | None = None
-        # along the surface itself it is not as the job had it
+        # a patch whose top follows the surface does not follow the job's planar lines
         if lines is not None and len(lines.rim) and not setup.process.nonplanar_top:
             wanted = np.isfinite(self.top_mm)
             low_mm, high_mm = float(self.box[2]), float(self.box[5])
@@ -83,7 +83,7 @@ class PatchModel:
         self._tip_cells = self.reach.cells_of(self.points_mm)
 
     def reach_of(self, field: HeightField, before: Reach | None = None) -> Reach:
-        """Where the nozzle may be over what stands there, around the patch."""
+        """Where the nozzle may be around the patch, over what stands there."""
         # the lowest pass lies at most one thick bead above the deficit's floor
         lowest_mm = max(0.0, float(self.box[2]))
         return Reach(
@@ -102,7 +102,7 @@ class PatchModel:
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
     def wanted_below(self, z_mm: float) -> Float[np.ndarray, "ny nx"]:
-        """Thickness of the deficit below a height, by column."""
+        """How thick the deficit is below a height, in each column."""
         below = np.bincount(
             self._column,
             weights=self._sign * np.minimum(self._z, z_mm),
@@ -112,24 +112,24 @@ class PatchModel:
 
     @cached_property
     def longest_span_mm(self) -> float:
-        """As far as a strand may go over air: what the material bears, or the job spans itself.
+        """The longest strand over air: what the material bears, or the longest that the job spans.
 
-        A column each way: rims are known to so much.
+        The job's span is widened by a column at each end, since rims are known no better.
         """
         job_mm = self._bridges.longest_mm() if self._bridges is not None else 0.0
         return max(self.material.max_bridge_mm, job_mm + 2.0 * self.cell_mm)
 
     @property
     def need_mm(self) -> Float[np.ndarray, "ny nx"]:
-        """How high the tip must at least be over each column."""
+        """The lowest height at which the tip clears everything, over each column."""
         index, inside = self._tip_cells
         need = np.where(inside, self.reach.need_mm[index[:, 0], index[:, 1]], -np.inf)
         return need.reshape(self.shape)
 
     def open_mm3(self, layer_mm: float) -> float:
-        """How much is missing where the head lets a layer be laid, whatever holds it.
+        """The missing volume that the head lets a layer be laid into, whether or not it holds.
 
-        Plastic goes as far aside as the flat presses it, and no farther below a tip than a layer.
+        Plastic goes aside as far as the nozzle's flat presses it, and at most a layer below it.
         """
         reach = round(self.spread_mm / self.cell_mm)
         y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * self.cell_mm
@@ -142,16 +142,16 @@ class PatchModel:
     def at(
         self, what: Shaped[np.ndarray, "ny nx"], points_mm: Float[np.ndarray, "n 2"], beyond: float
     ) -> Shaped[np.ndarray, " n"]:
-        """What is said of the columns below points; the same of all points beyond the patch."""
+        """The value of the column below each point; `beyond` for points outside the patch."""
         cells, inside = cells_below(points_mm, self.origin_mm, self.cell_mm, self.shape)
         return np.where(inside, what[cells[:, 0], cells[:, 1]], beyond)
 
     def free_at(self, reach: Bool[np.ndarray, "_ry _rx"]) -> Bool[np.ndarray, "ny nx"]:
-        """Columns over which the nozzle may be, from an answer of `reach`."""
+        """Columns over which the nozzle may be, from a mask on the cells of `reach`."""
         return self.reach.free_in_cells(self._tip_cells, reach).reshape(self.shape)
 
     def is_over(self, points_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Whether something is missing below points."""
+        """(n,) whether something is missing below each point."""
         return np.isfinite(self.at(self.top_mm, points_mm, np.inf))
 
     def raised(

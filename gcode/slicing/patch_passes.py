@@ -1,4 +1,4 @@
-"""The passes of a patch, from the floor up: where beads are due, and how much is in them."""
+"""One pass of a patch: along which lines beads are laid at a height, and with how much plastic."""
 
 from __future__ import annotations
 
@@ -21,19 +21,28 @@ from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_skin import Skin
 from gcode.slicing.patch_state import PatchState
 
-MOST_SAG = 0.9  # of a strand's thickness, that is reckoned with: something of it lies in its column
+# The most that a strand is taken to sag, of its thickness: part of it must stay in its column.
+MOST_SAG = 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Beads laid together, between all of which `reach` says where the tip may go directly.
+    """The beads of one pass, which are laid together.
 
     Attributes
     ----------
     z_mm
-        Height of the tip, or its greatest.
+        The height of the tip; where it follows a surface, the greatest.
+    height_mm
+        The mean thickness of the beads.
+    index
+        The number of the pass.
+    chains
+        The beads.
+    reach
+        Where the tip may go directly, from bead to bead.
     tip_mm
-        The same wherever it may go: on the cells of `Reach` where it follows a surface.
+        The height of the tip; where it follows a surface, on the cells of `Reach`.
     """
 
     z_mm: float
@@ -47,9 +56,13 @@ class Pass:
 def plan_pass(
     model: PatchModel, state: PatchState, at: Height, setup: PrintSetup, *, hems: bool
 ) -> tuple[Pass | None, PatchState]:
-    """Fill what is due at a height; the pass, and the state after it.
+    """Plan the pass at a height: find what is due there, and lay beads to fill it.
 
-    Along the job's own lines where there are any and they serve; else along lines of our own.
+    Beads follow the job's own lines where those are known and serve, and else newly drawn lines.
+
+    Returns
+    -------
+    The pass, None where nothing is laid; and the state of the columns after it.
     """
     planned = model.job.at(at.z_mm) if model.job is not None else None
     if not (model.free_at(at.reach) & model.near).any():
@@ -77,9 +90,9 @@ def plan_pass(
 
 
 def _fallen(model: PatchModel, state: PatchState, at: Height, due: Due) -> Due:
-    """Of what the job laid at a height, what may fall onto the floor where no line finds a hold.
+    """What is due at one of the job's heights where no line finds a hold: beads fall to the floor.
 
-    Where the head first gets into a hollow at one of the job's own heights, all above hangs on it.
+    Where the head first gets into a hollow at such a height, all layers above depend on it.
     """
     own = due_at(model, state, at)
     falls = (due.thick_mm > 0) & own.loose
@@ -97,7 +110,7 @@ def _along_own_held(
 
 
 def _told_cold(chain: Chain, model: PatchModel, state: PatchState, at: Height) -> Chain:
-    """The chain, told where it lies on what has long been there; what hangs lies on nothing."""
+    """The chain, marked where it lies on cold plastic; where it hangs it lies on nothing."""
     middles = 0.5 * (chain.xy_mm[1:] + chain.xy_mm[:-1])
     on_it = at.z_mm - model.at(state.surface_mm, middles, -np.inf) <= at.deep_mm
     return replace(chain, cold=np.asarray(on_it & (model.at(state.laid_mm, middles, 0.0) <= 0)))
@@ -105,7 +118,21 @@ def _told_cold(chain: Chain, model: PatchModel, state: PatchState, at: Height) -
 
 @dataclass(frozen=True, slots=True)
 class _Laying:
-    """Beads of one height, the thickness that columns get, and the share of it that they want."""
+    """Beads at one height along one kind of lines.
+
+    Attributes
+    ----------
+    chains
+        The beads.
+    laid_mm
+        The thickness that each column gets.
+    served
+        The share of what is due that columns get.
+    height_mm
+        The mean thickness.
+    lost
+        What was too thin for a bead.
+    """
 
     chains: list[Chain]
     laid_mm: Float[np.ndarray, "ny nx"]
@@ -121,10 +148,10 @@ def _after(
     laying: _Laying,
     planned: Bool[np.ndarray, "ny nx"] | None,
 ) -> PatchState:
-    """Columns with these beads on them."""
+    """The state of the columns once these beads are laid."""
     laid = laying.laid_mm
     hangs = (laid > 0) & due.hangs
-    # as far as a strand sags it lies below what is wanted, and leaves as much to fill over it
+    # a strand that sags lies partly below what is missing, and leaves as much to fill above it
     sag = np.where(laid > 0, np.minimum(due.bridges.sag_mm, MOST_SAG * laid), 0.0)
     done = state.done_mm
     if planned is not None:
@@ -151,7 +178,10 @@ def _along_either(
     due: Due,
     setup: PrintSetup,
 ) -> tuple[_Laying | None, Due]:
-    """Along the job's lines where they serve, else along what serves more; and what is due then."""
+    """Lay along the job's lines if they serve enough, else along those lines that serve more.
+
+    Also returns what is due then: where the job's lines are followed, no bridges of our own are.
+    """
     holds = Holds(model, state, at, model.options.bridges.beside_mm)
     along = _along_job(model, state, at, planned, due.thick_mm, setup, holds)
     if along is None or along.served < model.options.lines.served:
@@ -162,7 +192,7 @@ def _along_either(
 
 
 def _held(laying: _Laying, holds: Holds, model: PatchModel) -> _Laying:
-    """Without what would hang from one end where a line has no plastic further on."""
+    """Leave out stretches of beads that would hang from one end only."""
     chains: list[Chain] = []
     for chain in laying.chains:
         chains += [chain.part(a, b) for a, b in holds.stretches(chain.xy_mm)]
@@ -180,7 +210,7 @@ def _along_own(
     setup: PrintSetup,
     holds: Holds | None = None,
 ) -> _Laying | None:
-    """Along lines drawn into the columns, and straight ones over air."""
+    """Lay along newly drawn lines: perimeters and infill on ground, straight strands over air."""
     thick, bridges = np.where(due.alone, 0.0, due.thick_mm), due.bridges
     rest = np.where(bridges.over | bridges.ends, 0.0, thick)
     drawn = draw(rest, at.reach, SOLID_ANGLES_RAD[at.index % 2], model, setup)
@@ -216,10 +246,10 @@ def _along_job(
     setup: PrintSetup,
     holds: Holds,
 ) -> _Laying | None:
-    """Along what the job laid there, with as much of each line's plastic as is missing.
+    """Lay along the lines that the job laid there, with as much of their plastic as is missing.
 
-    Where walls keep the head off, so that lines end before them, none of them goes along the wall:
-    less is served.
+    Lines that run into a wall have to end where the head would touch it. No line then runs along
+    that wall, so that less is served.
     """
     options = model.options.lines
     assert model.job is not None
@@ -245,7 +275,7 @@ def _along_job(
 
 
 def _served(laid_mm: Float[np.ndarray, "ny nx"], due_mm: Float[np.ndarray, "ny nx"]) -> float:
-    """Share of what is due that columns get, by whatever lines: only so can they be compared."""
+    """The share of what is due that columns get; by this, kinds of lines are compared."""
     return float(np.minimum(laid_mm, due_mm).sum()) / float(due_mm.sum())
 
 
@@ -257,7 +287,7 @@ def plan_skin(
     index: int,
     setup: PrintSetup,
 ) -> tuple[Pass | None, PatchState]:
-    """The last pass, along the surface, where the planar ones left room for it."""
+    """Plan the last pass, along the part's own surface, where planar passes left room for it."""
     options = model.options
     wanted = state.left_below(model, np.inf)
     thick = np.minimum(model.top_mm - state.surface_mm, wanted + options.due.agree_mm)
@@ -280,7 +310,7 @@ def plan_skin(
 def skin_served(
     model: PatchModel, state: PatchState, skin: Skin | None, setup: PrintSetup
 ) -> Skin | None:
-    """A skin of the columns that its beads would get to."""
+    """The skin, restricted to the columns that its beads would reach."""
     if skin is None:
         return None
     thick = np.where(skin.columns, model.options.skin.thick_mm, 0.0)
@@ -295,7 +325,7 @@ def _along_skin(
     thick: Float[np.ndarray, "ny nx"],
     setup: PrintSetup,
 ) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
-    """Beads across the slope from the lowest up: the flat then reaches over what is still open."""
+    """Lay beads across the slope from the lowest up: the flat is then over open columns."""
     anywhere = np.ones(model.reach.shape, dtype=bool)  # among the skin's columns
     drawn = draw(thick, anywhere, skin.across_rad, model, setup, rings=0)
     beads = drawn.beads if drawn is not None else []

@@ -1,4 +1,4 @@
-"""The plan of a patch: every way to lay it that is worth a try, and the best by what it fills."""
+"""The plan of a patch: several ways to lay its passes are tried, and the best one is kept."""
 
 from __future__ import annotations
 
@@ -18,29 +18,30 @@ from gcode.slicing.patch_state import PatchState
 
 @dataclass(frozen=True, slots=True)
 class PatchPasses:
-    """Passes from the floor up, and the columns after them."""
+    """The passes of one way, from the floor up, and the state of the columns after them."""
 
     passes: tuple[Pass, ...]
     state: PatchState
 
     @property
     def beads_mm3(self) -> float:
-        """Plastic in all beads."""
+        """Volume of plastic in all beads."""
         return float(sum(chain.volume_mm3 for one in self.passes for chain in one.chains))
 
     def hem_mm3(self, model: PatchModel) -> float:
-        """What was laid in the air beside rims."""
+        """Volume of what was laid over air beside rims, as hems."""
         return float(self.state.laid_mm[self.state.hem].sum()) * model.cell_mm**2
 
     def filled_mm3(self, model: PatchModel) -> float:
-        """What is laid where something is missing."""
+        """Volume laid where something is missing."""
         filled_mm = np.minimum(self.state.laid_mm, model.wanted_below(np.inf))
         return float(filled_mm.sum()) * model.cell_mm**2 * model.weight
 
     def worth_mm3(self, model: PatchModel, setup: PrintSetup) -> float:
-        """What is filled, less what is too much, and less the time that it takes.
+        """How good this way is: volume filled, less volume spilt, less time, all in mm³.
 
-        By the process's weights: `repair_spill_weight`, and `repair_worth_mm3_s` for each second.
+        The process profile has the weights: `repair_spill_weight`, and `repair_worth_mm3_s` for
+        each second.
         """
         wanted = model.wanted_below(np.inf)
         cell_mm3 = model.cell_mm**2 * model.weight
@@ -59,9 +60,11 @@ class PatchPasses:
 def best_plan(
     model: PatchModel, grid: LayerGrid, setup: PrintSetup, progress: Progress
 ) -> PatchPasses:
-    """The best of the ways to lay a patch, of those that lay little enough in the air.
+    """The best of several ways to lay a patch.
 
-    Another way is tried where one leaves open what the head allows.
+    The ways differ in the heights at which hollows get extra passes (`Openings`). The next one is
+    tried only where the last leaves something open that the head could reach. A way that lays much
+    of its plastic over air beside rims is planned again without that.
     """
     options = model.options.due
     open_mm3 = model.open_mm3(grid.layer_height_mm)
@@ -82,7 +85,7 @@ def best_plan(
 def plan(
     model: PatchModel, heights: Heights, setup: PrintSetup, progress: Progress, *, hems: bool
 ) -> PatchPasses:
-    """Passes from the floor up, in one way; with `hems`, begun from the air beside a rim too."""
+    """Plan the passes of one way; with `hems`, beads may begin over air beside a rim."""
     state = PatchState.begun(model)
     skin = None
     if setup.process.nonplanar_top:

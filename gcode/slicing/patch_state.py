@@ -1,4 +1,4 @@
-"""What has been laid on a patch's columns so far: immutable, each pass makes the next one."""
+"""The state of a patch's columns after some passes: immutable, each pass makes the next one."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ SAME_TIP_MM = 0.02  # passes nearer to each other lie beside, not on, each other
 
 @dataclass(frozen=True, slots=True)
 class PatchState:
-    """Columns of a patch after some passes.
+    """The columns of a patch after some passes.
 
     Attributes
     ----------
     surface_mm
-        Height predicted over each column; where something hangs the nozzle's, whatever lies open
-        below, less what a bridge sags.
+        The predicted height of each column's surface. Where a strand hangs over a gap, it is the
+        strand's height less its sag.
     laid_mm, sunk_mm
-        Thickness laid on each column, and given up under what hangs over it.
+        The thickness laid on each column, and the thickness given up under hanging strands.
     done_mm
-        Up to where the job's own lines are laid again.
+        The height up to which the job's own lines are laid again.
     planar_top_mm
-        Where each column ends for passes at one height.
+        The height at which each column ends for planar passes.
     hem
-        Columns laid in the air beside a rim.
+        Columns laid over air beside a rim.
     loose
-        Columns whose beads fell onto the floor, and those on top of them: no strand is held there.
+        Columns whose beads fell onto the floor, or lie on such beads: they hold no strand.
     hung_mm
-        Height at which each column was last laid over air; −∞ where it never was.
+        The height at which each column was last laid over air; −∞ where it never was.
     too_long_mm
-        Where a bridge would be longer than the material bears, how long; 0 elsewhere.
+        The length of a bridge that would be longer than the material bears; 0 elsewhere.
     lost
-        What was found too thin, pass by pass.
+        What was too thin for a bead, pass by pass.
     """
 
     surface_mm: Float[np.ndarray, "ny nx"]
@@ -53,7 +53,7 @@ class PatchState:
 
     @classmethod
     def begun(cls, model: PatchModel) -> PatchState:
-        """Before the first pass."""
+        """The state before the first pass."""
         nothing = np.zeros(model.shape)
         return cls(
             surface_mm=model.floor_mm,
@@ -68,19 +68,19 @@ class PatchState:
         )
 
     def hangs_at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
-        """Columns that hang at a height: what is laid at the same height they do not hold."""
+        """Columns that hang at a height, and so hold nothing that is laid at the same height."""
         return np.asarray(self.hung_mm > z_mm - SAME_TIP_MM)
 
     def firm_at(self, z_mm: float) -> Bool[np.ndarray, "ny nx"]:
-        """Columns whose top holds a strand's end at a height: it neither fell nor hangs there."""
+        """Columns that hold a strand's end at a height: their top neither fell nor hangs there."""
         return ~self.loose & ~self.hangs_at(z_mm)
 
     def left_below(self, model: PatchModel, z_mm: float) -> Float[np.ndarray, "ny nx"]:
-        """Thickness wanted below a height and not laid or given up; negative where more was."""
+        """Thickness still missing below a height; negative where more was laid than was missing."""
         return model.wanted_below(z_mm) - self.laid_mm - self.sunk_mm
 
     def without(self, model: PatchModel, columns: Bool[np.ndarray, "ny nx"]) -> PatchState:
-        """As if nothing had been laid on some columns."""
+        """The state as if nothing had been laid on some columns."""
         nothing = np.where(columns, 0.0, 1.0)
         return replace(
             self,

@@ -31,7 +31,7 @@ from test_batch_kills import children_of
 from test_loop_kills import make_ready
 
 from amrepair.fleet.desk import STATUS, read_note
-from amrepair.loop.setting import JOB
+from amrepair.loop.run_folder import JOB
 from amrepair.loop.tape import read_events
 from amrepair.template import fit_template
 from gcode.firmware import EmulatedPrinterProcess

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from amrepair.cli import calibrating
+from amrepair.cli import pose_calibration
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.loop.calibrate import read_calibration, target_solid
 from gcode.firmware import EmulatedPrinterProcess
@@ -57,8 +57,10 @@ def test_the_scanner_is_found_from_a_printed_target(tmp_path: Path) -> None:
         eye.start()
         began = time.monotonic()
         try:
-            source = calibrating.Source(machine.port, f"watch:{drop}", None, None, 0, 60.0, "m")
-            calibrating.run(out, IDS, source, max_residual_mm=0.15, seed=0, as_json=False)
+            source = pose_calibration.Source(
+                machine.port, f"watch:{drop}", None, None, 0, 60.0, "m"
+            )
+            pose_calibration.run(out, IDS, source, max_residual_mm=0.15, seed=0, as_json=False)
         finally:
             over.set()
             eye.join()
@@ -79,5 +81,5 @@ def calibrating_seconds() -> float:
     from gcode.profiles import load_setup
 
     setup = load_setup(*IDS)
-    program = calibrating._target(setup).program
+    program = pose_calibration._target(setup).program
     return estimate(program, setup.printer).print_time_s

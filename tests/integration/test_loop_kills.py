@@ -22,7 +22,7 @@ from loop_children import PRINTER, beads_of
 from amrepair.frames import Transform
 from amrepair.loop import plan_stops
 from amrepair.loop.replay import replay
-from amrepair.loop.setting import JOB, Setting, keep, open_run
+from amrepair.loop.run_folder import JOB, Setting, keep, open_run
 from amrepair.loop.tape import read_events
 from amrepair.scans import write_ply
 from amrepair.simulate.columns import IntervalMap

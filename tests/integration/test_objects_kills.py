@@ -17,7 +17,7 @@ from objects_job import Block, labelled, plate, with_bed
 
 from amrepair.frames import Transform
 from amrepair.loop import plan_stops
-from amrepair.loop.setting import Setting, keep
+from amrepair.loop.run_folder import Setting, keep
 from amrepair.scans import write_ply
 from amrepair.template import MeshSdf
 from gcode.profiles import load_setup

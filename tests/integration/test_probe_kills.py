@@ -18,7 +18,7 @@ from probe_job import plate, standing
 
 from amrepair.frames import Transform
 from amrepair.loop import plan_stops
-from amrepair.loop.setting import Setting, keep
+from amrepair.loop.run_folder import Setting, keep
 from amrepair.loop.tape import TAPE, read_events
 from amrepair.scans import PROBE
 from gcode.reader import read_job

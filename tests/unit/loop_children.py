@@ -16,7 +16,7 @@ from amrepair.errors import ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import LoopOptions, Records, Tape, run_loop
 from amrepair.loop.pick_up import pick_up
-from amrepair.loop.setting import open_run
+from amrepair.loop.run_folder import open_run
 from amrepair.loop.sites import sites
 from amrepair.loop.tape import read_events
 from amrepair.report.folder import RunFolder

@@ -13,7 +13,7 @@ from loop_children import Dying
 from amrepair.loop import LoopOptions, Records, run_loop
 from amrepair.loop.pick_up import pick_up
 from amrepair.loop.probing import PortFeeler, ProbeScanner
-from amrepair.loop.setting import open_run
+from amrepair.loop.run_folder import open_run
 from amrepair.loop.sites import sites
 from gcode.check import check
 from gcode.firmware import FirmwareCore

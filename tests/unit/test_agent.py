@@ -27,7 +27,7 @@ from loop_bench import scan_of
 from small_klipper import CommandError, SmallKlipper
 
 from amrepair.agent import MACROS, shipped
-from amrepair.loop.marks import marked_stops
+from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.travel import park
 from amrepair.postprocess import LooksAsked, mark
 from gcode.check import check

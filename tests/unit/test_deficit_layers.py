@@ -10,7 +10,7 @@ import trimesh
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.frames import Transform
 from amrepair.policy import USUAL_POLICY
-from amrepair.policy.worth import Piece, worth_mending
+from amrepair.policy.acceptance import Piece, worth_mending
 from amrepair.regions import detect
 from amrepair.scans import ScanRequest
 from amrepair.simulate.parameters import load_world

@@ -17,7 +17,7 @@ from amrepair.deficit.voxels import VoxelBox, solids_from_field
 from amrepair.errors import InputError
 from amrepair.frames import Transform, rotation_from_vector
 from amrepair.regions import Label, detect
-from amrepair.regions.calibration import NORMAL_NOISE
+from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from tests import analytic

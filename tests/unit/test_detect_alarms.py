@@ -7,9 +7,9 @@ import pytest
 
 from amrepair.arrays import Points, Values
 from amrepair.regions import Label, detect
-from amrepair.regions.calibration import NORMAL_NOISE
+from amrepair.regions.error_calibration import NORMAL_NOISE
+from amrepair.regions.observation import observed
 from amrepair.regions.options import RegionOptions
-from amrepair.regions.sites import observed
 from amrepair.scans import Scan
 from tests.analytic import box, cylinder, difference, sample_surface
 

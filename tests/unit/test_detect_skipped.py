@@ -15,8 +15,11 @@ from amrepair.deficit import Deficit, compute_deficit
 from amrepair.field.as_built import Evidence
 from amrepair.frames import Transform
 from amrepair.regions import detect
+from amrepair.regions.bead_paths import BeadPaths
+from amrepair.regions.beads_as_laid import wall_shift_mm
 from amrepair.regions.options import USUAL_SKIPPED
-from amrepair.regions.skipped import PlannedBeads, _Paths, _wall_shift, skipped
+from amrepair.regions.planned_beads import PlannedBeads
+from amrepair.regions.skipped import skipped
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
@@ -152,7 +155,7 @@ def test_in_the_first_layers_all_walls_tell_that_a_part_lies_aside(gone: bool, s
     evidence = detect(scan, planned, top_z_mm=high_mm).evidence
     assert evidence is not None
     middle = np.array([[x, 0.5 * WIDE_MM, 2.5 * HIGH_MM] for x in np.linspace(1.0, 23.0, 30)])
-    moved = _wall_shift(middle, evidence, planned, USUAL_SKIPPED)
+    moved = wall_shift_mm(middle, evidence, planned, USUAL_SKIPPED)
     # cells on rims hold points of the top, too: most of it is found, and never more
     share = moved[:, :2] / aside_mm
     assert (share > 0.3).all()
@@ -386,7 +389,7 @@ def test_a_stretch_goes_on_round_a_corner_as_long_as_samples_say_open(open_again
     start = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0], [20.0, 0.0, 1.0]])
     end = np.array([[10.0, 0.0, 1.0], [10.0, 8.0, 1.0], [30.0, 0.0, 1.0]])  # the last is apart
     lines = PlannedBeads(start, end, np.full(3, WIDE_MM), np.full(3, HIGH_MM))
-    paths = _Paths.of(lines, USUAL_SKIPPED)
+    paths = BeadPaths.of(lines, USUAL_SKIPPED)
     along_mm = paths.at_mm
     gone = np.where((along_mm > 6.0) & (along_mm < 14.0), 0.2, -1.0)
     gone[np.argmin(np.abs(along_mm - 10.6))] = -0.1  # one sample among others
@@ -413,7 +416,7 @@ def test_a_stretch_goes_on_through_what_is_too_short_to_begin_one() -> None:
     start, end = (
         np.vstack([corners[a:b], alone[k : k + 1]]) for k, a, b in ((0, 0, -1), (1, 1, 5))
     )
-    paths = _Paths.of(
+    paths = BeadPaths.of(
         PlannedBeads(start, end, np.full(5, WIDE_MM), np.full(5, HIGH_MM)), USUAL_SKIPPED
     )
     assert len(paths.lines.width_mm) == 4  # the one alone is too short

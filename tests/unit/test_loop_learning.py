@@ -17,9 +17,9 @@ from amrepair.frames import Transform
 from amrepair.loop import LoopReport, Stop, Tape, plan_stops
 from amrepair.loop.learning import FIRST_LOOKS, OWN_CALIBRATION, told
 from amrepair.loop.replay import replay
-from amrepair.loop.setting import Setting, keep, open_run
+from amrepair.loop.run_folder import Setting, keep, open_run
 from amrepair.loop.sites import sites
-from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.repair import Site
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan, ScanRequest

@@ -12,7 +12,7 @@ from amrepair.errors import InputError, LoopError
 from amrepair.loop import Tape, plan_stops
 from amrepair.loop.pace import Pace, Stops, layers_at
 from amrepair.loop.replay import replay
-from amrepair.loop.setting import Setting, keep
+from amrepair.loop.run_folder import Setting, keep
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan, ScanRequest
 

@@ -12,7 +12,7 @@ from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop import Tape, plan_stops
 from amrepair.loop.replay import decide_again, replay
-from amrepair.loop.setting import Setting, keep
+from amrepair.loop.run_folder import Setting, keep
 from amrepair.report.folder import RunFolder
 
 

@@ -12,7 +12,8 @@ from loop_bench import solid_mesh
 from amrepair.frames import Transform
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.sites import sites
-from amrepair.repair import RepairPlan, Site, in_view, plan_repair
+from amrepair.repair import RepairPlan, Site, plan_repair
+from amrepair.repair.path_offsets import off_by_job
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.profiles import load_setup
@@ -157,7 +158,7 @@ def test_a_part_is_as_high_as_its_own_layer_and_not_as_its_support_s() -> None:
 
 def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
     job, site = supported()
-    beyond = in_view.off_by_job(site, HERE)
+    beyond = off_by_job(site, HERE)
     assert beyond is not None
     support = job.beads.role == len(job.beads.roles) - 1
     middle = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support] - [0.0, 0.0, 0.1]
@@ -169,7 +170,7 @@ def test_what_a_support_s_strands_stray_by_is_not_too_much() -> None:
 def test_a_support_s_strands_sag_and_the_part_s_beside_them_do_not() -> None:
     """regression: the first tops of a support over its pillars were filled up (1 to 3 mm³)."""
     job, site = supported()
-    off = in_view.off_by_job(site, HERE)
+    off = off_by_job(site, HERE)
     assert off is not None
     support = job.beads.role == len(job.beads.roles) - 1
     tops = 0.5 * (job.beads.start_mm + job.beads.end_mm)[support]

@@ -12,11 +12,11 @@ from turns_job import SETUP, InTurn, Tower, copies, hits, in_turn, seen
 
 from amrepair.errors import InputError
 from amrepair.loop import LoopReport, Stop, plan_stops, run_loop, travel
-from amrepair.loop.in_turn import finished_at, template_of
 from amrepair.loop.locate import locate_parts
-from amrepair.loop.marks import marked_stops
+from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.objects import is_laid
 from amrepair.loop.pace import Pace, Stops, layers_at, layers_every
+from amrepair.loop.sequential_objects import finished_at, template_of
 from amrepair.loop.sites import sites
 from amrepair.policy import Action
 from amrepair.postprocess import LooksAsked, mark

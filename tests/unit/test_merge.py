@@ -16,7 +16,7 @@ from amrepair.merge.fuse import Cloud, Fused, _poisson, fuse
 from amrepair.merge.place import Placement, place
 from amrepair.merge.views import View
 from amrepair.regions import Label, detect
-from amrepair.regions.calibration import NORMAL_NOISE
+from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.scans import Scan
 from amrepair.template import LearnedSdf, MeshSdf, load_template
 from tests.analytic import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from amrepair.regions.bed import by_beds, of_bed
-from amrepair.regions.calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 

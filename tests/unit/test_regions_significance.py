@@ -15,13 +15,13 @@ from amrepair.cli.inspect import _refuse_too_noisy
 from amrepair.errors import InputError
 from amrepair.field.scales import RANK, WINDOW_FACING, scales_of
 from amrepair.regions import Label, detect
-from amrepair.regions.calibrating import calibrated
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration, FarOff
 from amrepair.regions.detection import judged_scales
+from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration, FarOff
+from amrepair.regions.error_calibration_fit import calibrated
+from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import Tail, as_normal, as_student
 from amrepair.regions.significance import tested as levels_of
-from amrepair.regions.sites import Sites
 from amrepair.scans import Scan
 from tests.analytic import (
     AnalyticTemplate,
@@ -145,9 +145,9 @@ def test_a_small_scan_tells_its_wander_less_surely_than_a_large_one(ball: Analyt
     )
     usual = []
     for scan, part in ((Scan(points, 0.04, "template"), small), (rough(ball, 0), ball)):
-        sites = detect(scan, part).sites
-        assert sites is not None
-        usual.append(float(np.median(levels_of(sites, RegionOptions(), None)[1].freedom)))
+        inspected = detect(scan, part).inspected
+        assert inspected is not None
+        usual.append(float(np.median(levels_of(inspected, RegionOptions(), None)[1].freedom)))
     assert usual[1] > 60.0
     assert usual[0] > 5.0
 
@@ -208,13 +208,13 @@ def test_what_is_seen_more_aslant_than_anything_that_told_errs_the_more() -> Non
     n = len(place_mm)
     aslant = place_mm[:, 0] > 15.0
     options = RegionOptions(process_sigma_mm=0.0)
-    sites = Sites(
+    inspected = Inspected(
         cells=n, cell_mm=0.5, place_mm=place_mm, normal=np.tile([0.0, 0.0, 1.0], (n, 1)),
         value_mm=rng.normal(0.0, 0.01, n), weight=np.full(n, 4.0),
         tolerance_mm=np.full((2, n), 0.2), facing=np.where(aslant, 0.3, 0.9), pose_mm=np.zeros(n),
     )  # fmt: skip
     known = Calibration("bench", 1, (1.5,), ((0.1,),), ((50.0,),), facing=0.9)
-    for level in levels_of(sites, options, known)[1:2]:
+    for level in levels_of(inspected, options, known)[1:2]:
         far = level.scale.place_mm[:, 0] - 15.0
         squarely = level.errors.common_mm[far < -5.0]
         assert squarely == pytest.approx(0.1, rel=0.02)

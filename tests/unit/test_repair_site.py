@@ -15,7 +15,8 @@ from amrepair.loop import Stop
 from amrepair.loop.sites import sites
 from amrepair.regions.options import RegionOptions
 from amrepair.repair import Site, plan_repair
-from amrepair.repair.in_view import aligning, off_by_job, so_far
+from amrepair.repair.path_offsets import off_by_job
+from amrepair.repair.scan_scope import align_options, planned_so_far
 from amrepair.scans import Scan
 
 
@@ -47,7 +48,7 @@ def test_a_clean_look_into_shallow_open_infill_fits(small: Small, above_skin: in
     site, _ = look(small, layer)
     scan = scan_from_above(site, small.placed, 0.1)
     guess = Transform("template", "scanner", small.placed.inverse().matrix)
-    found = align(scan, site.template, guess=guess, so_far=so_far(site))
+    found = align(scan, site.template, guess=guess, so_far=planned_so_far(site))
     moved = found.template_from_scan.apply(scan.points_mm)
     off_mm = moved - small.placed.inverse().apply(scan.points_mm) - [0.0, 0.0, 0.1]
     assert np.abs(off_mm).max() < 0.06
@@ -63,8 +64,8 @@ def test_walls_that_are_gone_on_one_side_leave_the_pose_alone(small: Small) -> N
     gone = (there[:, 1] < 0.5 * (low[1] + high[1])) & (there[:, 2] > top_mm - 0.7 * layer_mm)
     lower = replace(scan, points_mm=scan.points_mm - gone[:, None] * [0.0, 0.0, layer_mm])
     guess = Transform("template", "scanner", small.placed.inverse().matrix)
-    options = aligning(site)
-    found = align(lower, site.template, guess=guess, so_far=so_far(site), options=options)
+    options = align_options(site)
+    found = align(lower, site.template, guess=guess, so_far=planned_so_far(site), options=options)
     aside_mm = found.template_from_scan.apply(scan.points_mm) - there
     assert np.abs(aside_mm).max() < 0.05
 

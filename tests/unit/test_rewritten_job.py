@@ -8,7 +8,7 @@ from objects_job import Block, labelled
 from test_octoprint_plugin import Wire
 
 from amrepair.loop import Stop
-from amrepair.loop.marks import marked_stops
+from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.objects import Course
 from amrepair.loop.travel import park
 from amrepair.postprocess import LooksAsked, mark

@@ -11,8 +11,8 @@ from amrepair.frames import Transform
 from amrepair.loop import plan_stops
 from amrepair.loop.sites import sites
 from amrepair.repair import Site, plan_repair
-from amrepair.repair.in_view import of_layer
 from amrepair.repair.options import USUAL_REPAIR
+from amrepair.repair.scan_scope import within_planned
 from amrepair.scans import Scan
 from amrepair.template import PlannedSdf
 from amrepair.template import planned_kernels as kernels
@@ -165,7 +165,7 @@ def test_points_below_a_cut_template_are_not_judged_whatever_stands_beside_it() 
     low_mm = float(planned.bounds_mm[0, 2])
     z_mm = np.arange(0.1, 6.0, 0.1)
     scan = Scan(np.column_stack([np.zeros_like(z_mm), np.zeros_like(z_mm), z_mm]), 0.02, "template")
-    seen_mm = of_layer(scan, site).points_mm[:, 2]
+    seen_mm = within_planned(scan, site).points_mm[:, 2]
     assert seen_mm.min() == pytest.approx(low_mm + USUAL_REPAIR.planned_edge_mm, abs=0.11)
     whole = beads_of_a_block(5)
-    assert of_layer(scan, Site(whole, setup, site.grid, planned=whole)) is scan
+    assert within_planned(scan, Site(whole, setup, site.grid, planned=whole)) is scan

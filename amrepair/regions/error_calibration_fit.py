@@ -1,4 +1,7 @@
-"""A calibration from the tested scales of sound scans, or of the bed in many looks."""
+"""Making a calibration of errors, from scans of sound parts or from the bed seen in many looks.
+
+A scan of a sound surface is tested as any other; what the test finds there can only be errors.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +12,32 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.errors import InputError
-from amrepair.regions.calibration import HALF_OCTAVE, Calibration, FarOffTold
+from amrepair.regions.error_calibration import HALF_OCTAVE, Calibration, FarOffTold
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import LEAST_PEAKS, Level
 
-# Of no such place at all.
+# No outlier was seen.
 NONE_FAR_OFF: FarOffTold = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class SoundScale:
-    """What one tested scale of sound places shows of a scan's errors.
+    """What one tested scale of a sound surface shows of a scan's errors.
 
     Attributes
     ----------
     width_mm, windows
-        Of its windows, and how many there are.
+        The width of its windows, and how many there are.
     facing
-        Cosine of incidence of all but a few windows, at least.
+        All but a few windows were seen at a cosine of incidence of at least this.
     wander_mm, freedom
-        (c,) standard deviation of window means, by how well they were seen, and its degrees of
-        freedom.
+        (c,) standard deviation of window means for each class of how well windows were seen, and
+        its degrees of freedom.
     window_mm, common_mm, error_mm
-        What windows err by themselves, what their cells have in common, and the standard error of
-        what is tested: medians.
+        Medians of the independent part of a window's standard error, of the part that its cells
+        have in common, and of the standard error of the tested statistic.
     far_mm
-        For missing and excess: how far beyond what is allowed places lie that stand out.
+        For missing and for excess: how far beyond the tolerance outliers lie.
     """
 
     width_mm: float
@@ -49,11 +52,11 @@ class SoundScale:
 
 
 Sound = tuple[SoundScale, ...]
-"""Of one scan: three cells together, then windows by rising width."""
+"""The scales of one scan: three cells together, then windows by rising width."""
 
 
 def sound_scales(levels: Sequence[Level], options: RegionOptions) -> Sound:
-    """What the tested scales of sound places show of a scan's errors."""
+    """Summarise the tested scales of a scan of a sound surface."""
     return tuple(
         SoundScale(
             level.scale.width_mm,
@@ -71,7 +74,7 @@ def sound_scales(levels: Sequence[Level], options: RegionOptions) -> Sound:
 
 
 def calibrated(name: str, scans: Sequence[Sound], options: RegionOptions) -> Calibration:
-    """What scans of sound places tell of a scanner's errors.
+    """Make a calibration of what scans of sound surfaces show.
 
     Raises
     ------
@@ -99,7 +102,7 @@ def calibrated(name: str, scans: Sequence[Sound], options: RegionOptions) -> Cal
 
 
 def by_width(scans: Sequence[Sound]) -> dict[float, list[SoundScale]]:
-    """The scales of windows by width, rising, each with those of half an octave to either side."""
+    """The scales by rising width of windows; each with those within half an octave of it."""
     every = [scale for scales in scans for scale in scales[1:]]
     octave = np.log2([scale.width_mm for scale in every])
     found = {}
@@ -110,8 +113,8 @@ def by_width(scans: Sequence[Sound]) -> dict[float, list[SoundScale]]:
 
 
 def _wander(alike: Sequence[SoundScale]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """By class: root of the mean square of what windows wander by, and all degrees of freedom."""
-    # of windows too wide for what was seen none are far enough apart to tell
+    """For each class the root mean square of the scans' wander, and the summed freedom."""
+    # where windows are too wide for a small scan, none are far enough apart to tell their wander
     alike = [scale for scale in alike if scale.wander_mm[0] > 0.0] or alike
     classes = max(len(scale.wander_mm) for scale in alike)
     wander, freedom = (
@@ -125,11 +128,11 @@ def _wander(alike: Sequence[SoundScale]) -> tuple[tuple[float, ...], tuple[float
 def _far_off(
     alike: Sequence[Sequence[SoundScale]], octave: Sequence[float], side: int, usual: float
 ) -> list[FarOffTold]:
-    """What lies far off to one side, of three cells together and then by rising width.
+    """The outliers to one side, of three cells together and then of windows by rising width.
 
-    Before any is seen its spread is taken to be `usual` standard errors, which is worth a few
-    places. Windows up to twice as wide as the narrowest that have none take after those: what lies
-    far off there may reach into them, so that one place at least is taken to.
+    Before any outlier is seen the spread is taken to be `usual` standard errors; this prior counts
+    as much as a few outliers. Windows without an outlier, up to twice as wide as the narrowest,
+    take the spread of the narrowest and one outlier at least, since those may reach into them.
     """
     found: list[FarOffTold] = []
     narrowest: tuple[float, float] | None = None

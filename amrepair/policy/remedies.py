@@ -1,4 +1,8 @@
-"""What can be done about a defect that was found too late for the nozzle to get to all of it."""
+"""What can be done about a defect that later layers have buried.
+
+A defect that is found layers later may lie where the nozzle no longer gets to all of it. Then there
+are two remedies: cut the part down and print it again from there, or leave the rest open.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +12,22 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One way to go on, told before anybody chooses.
+    """One remedy, with what it costs, as it is shown to whoever has to choose.
 
     Attributes
     ----------
     name
         `reprint`: stop, cut the part down, print from there on; `leave`: go on as it is.
     filled_mm3, left_mm3
-        Of what is buried: what this way brings back, and what stays open.
+        How much of the buried volume this remedy fills, and how much stays open.
     print_time_s, filament_mm3
-        What is printed a second time.
+        Time and material for what is printed a second time.
     layer
-        First layer of the job that is printed again; None where none is.
+        The first layer of the job that is printed again; None for `leave`.
     cut_to_mm
-        Height to which the part is cut down, build frame; None where nothing is cut.
+        The height to which the part is cut down, build frame; None for `leave`.
     command
-        What makes the program that prints it again; empty where none does.
+        The command that makes the program for the reprint; empty for `leave`.
     """
 
     name: str

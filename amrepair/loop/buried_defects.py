@@ -11,7 +11,7 @@ import numpy as np
 
 from amrepair.loop.looks import Look, Stop
 from amrepair.policy import USUAL_POLICY, PolicyOptions
-from amrepair.policy.ways import Way
+from amrepair.policy.remedies import Way
 from amrepair.repair import RepairPlan
 from gcode.estimate import estimate
 from gcode.profiles import PrintSetup

@@ -1,8 +1,8 @@
-"""Other ways to lay a broken part on the bed, and how much of what is missing each lets through.
+"""Reorientation: other ways to lay a broken part on the bed, and what the nozzle reaches in each.
 
-What the nozzle cannot get to as the part stands is often open to it from another side. Nothing is
-turned here: the share is found by slicing the turned deficit onto what would stand there; the part
-is then laid so, scanned in the bed's frame and repaired like any other.
+What the nozzle cannot reach as the part stands is often open to it from another side. Nothing is
+moved here: the deficit is sliced as if it were turned, onto what would then stand there. A person
+lays the part so, scans it in the bed's frame, and repairs it like any other.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ TIPPING_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
-    """A way to lay the part on the bed.
+class Reorientation:
+    """A way to lay the part on the bed, with what the nozzle would reach.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ def turns_named(words: Sequence[str]) -> tuple[str, ...]:
 
 def turns_of(
     plan: RepairPlan, site: Site, names: Sequence[str], *, progress: Progress = silent
-) -> tuple[Turn, ...]:
+) -> tuple[Reorientation, ...]:
     """`rank_turns` of what a plan says is missing."""
     if plan.deficit.missing.is_empty():
         return ()
@@ -100,7 +100,7 @@ def rank_turns(
     setup: PrintSetup,
     grid: LayerGrid,
     progress: Progress = silent,
-) -> tuple[Turn, ...]:
+) -> tuple[Reorientation, ...]:
     """What each turn would let the nozzle reach, best first; ties as named.
 
     Parameters
@@ -123,7 +123,7 @@ def _tried(
     standing: manifold3d.Manifold,
     setup: PrintSetup,
     grid: LayerGrid,
-) -> Turn:
+) -> Reorientation:
     """Slice the turned deficit onto the turned rest, in the middle of the bed."""
     turn = NAMED_TURNS[name]
     printer = setup.printer
@@ -131,7 +131,7 @@ def _tried(
     low, high = box_of_solid(rest)
     size = high - low
     if (size[:2] > printer.bed_size_mm).any() or size[2] > printer.max_z_mm:
-        return Turn(name, 0.0, stands=False)
+        return Reorientation(name, 0.0, stands=False)
     move = (*(printer.bed_middle_mm - 0.5 * (low + high)[:2]), -low[2])
     rest, wanted = rest.translate(move), missing.rotate(turn).translate(move)
     patch = slice_patch(
@@ -141,7 +141,7 @@ def _tried(
         grid=grid,
         standalone=True,
     )
-    return Turn(name, float(patch.reachable_mm3 / wanted.volume()), _stands(rest))
+    return Reorientation(name, float(patch.reachable_mm3 / wanted.volume()), _stands(rest))
 
 
 def _stands(solid: manifold3d.Manifold) -> bool:

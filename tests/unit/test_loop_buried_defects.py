@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from amrepair.cli.app import app as repair_app
-from amrepair.loop.buried import buried, buried_mm3, ways
+from amrepair.loop.buried_defects import buried, buried_mm3, ways
 from amrepair.loop.looks import Stop
 from amrepair.policy import USUAL_POLICY, Action, decide
 from amrepair.policy.replay import decided_again

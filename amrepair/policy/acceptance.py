@@ -1,4 +1,8 @@
-"""What is worth a repair: pieces of a deficit weighed together where they are one defect."""
+"""Acceptance: which missing pieces are worth a repair, and which excess is too much.
+
+A piece alone may be too small to count while it belongs to a larger defect. Pieces are therefore
+grouped into defects first, and it is the volume of the whole defect that decides.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +19,9 @@ from amrepair.regions import Label, Region
 
 
 class Piece(NamedTuple):
-    """What is weighed of a piece of a deficit.
+    """One connected piece of missing material, as far as acceptance needs to know it.
 
-    `skipped`: lines of the job are gone in it.
+    `skipped` says that whole lines of the job are missing in it.
     """
 
     box_mm: Box
@@ -26,16 +30,17 @@ class Piece(NamedTuple):
 
     @classmethod
     def of(cls, region: Region) -> Piece:
-        """Of one that was measured."""
+        """From a measured region."""
         return cls(np.asarray(region.box_mm), region.volume_mm3, region.skipped)
 
 
 def defect_volumes(pieces: Sequence[Piece], options: PolicyOptions = USUAL_POLICY) -> Values:
-    """(n,) volume of the defect that each piece belongs to, mm³; a crumb's is 0.
+    """(n,) volume of the defect that each piece belongs to, mm³.
 
-    Skipped beads that cross leave several pieces side by side: one defect. Those that rays went
-    through have one cause, wherever they lie: the extruder slipped. Crumbs join nothing: what is
-    below what a bead fills and, of lines far apart, below `line_mm3`.
+    Pieces within `one_defect_mm` of each other are one defect: crossing lines that were skipped
+    leave several side by side. Pieces in which lines were skipped are one defect wherever they lie,
+    since the slipping extruder is their common cause. A piece smaller than `crumb_mm3` belongs to
+    no defect and gets 0; a skipped line smaller than `line_mm3` is not joined to distant ones.
     """
     volume = np.array([piece.volume_mm3 for piece in pieces])
     whole = np.zeros(len(volume))
@@ -57,27 +62,27 @@ def _skipped(pieces: Sequence[Piece]) -> Mask:
 
 
 def worth_mending(pieces: Sequence[Piece], options: PolicyOptions = USUAL_POLICY) -> Mask:
-    """(n,) pieces of a defect that is worth a repair; see `defect_volumes`."""
+    """(n,) whether each piece belongs to a defect that is worth a repair (see `defect_volumes`)."""
     least_mm3 = np.where(_skipped(pieces), options.least_skipped_mm3, options.least_mm3)
     return np.asarray(defect_volumes(pieces, options) >= least_mm3)
 
 
 def to_fill(regions: Sequence[Region], options: PolicyOptions = USUAL_POLICY) -> tuple[Region, ...]:
-    """Missing regions that are worth a repair: alone, or with those beside them."""
+    """The missing regions that are worth a repair, alone or together with others near them."""
     missing = [region for region in regions if region.label is Label.MISSING]
     keep = worth_mending([Piece.of(region) for region in missing], options)
     return tuple(region for region, kept in zip(missing, keep, strict=True) if kept)
 
 
 def volume_mm3(regions: Sequence[Region]) -> float:
-    """Volume of some regions together."""
+    """The summed volume of some regions."""
     return float(sum(region.volume_mm3 for region in regions))
 
 
 def too_much(
     regions: Sequence[Region], layer_mm: float, options: PolicyOptions = USUAL_POLICY
 ) -> tuple[Region, ...]:
-    """Regions in excess that stand out."""
+    """The regions of excess that are large and high enough to matter."""
     return tuple(
         region
         for region in regions

@@ -1,7 +1,8 @@
-"""Calibration: what a scanner and a printer leave on sound parts, learned once and kept by name.
+"""Calibration of errors: a noise model of a scanner and a printer, learned once from sound parts.
 
-It stands in for what a scan has to tell of itself: how far window means wander, by their width and
-by how densely they were seen, and how far off sound places may seem to lie.
+A calibration replaces what a scan can tell of its own errors: how far window means wander, for each
+width and for how well windows were seen, and how far off sound places may seem to lie. It is kept
+as a file by name. (Where a scanner hangs over the bed is another thing: `amrepair.loop.calibrate`.)
 """
 
 from __future__ import annotations
@@ -22,25 +23,25 @@ CALIBRATION_VERSION = 4
 
 
 FarOffTold = tuple[float, float, float]
-# Windows are twice as wide from scale to scale: by half of that widths are told apart.
+# From scale to scale windows double in width; widths within half of that step count as the same.
 HALF_OCTAVE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class FarOff:
-    """How far beyond what is allowed sound places seem to lie where a scanner errs most.
+    """Outliers: how far beyond the tolerance sound places seem to lie where a scanner errs most.
 
-    What lies so far off is as deep at places that are seen well as at others, whatever they err by
-    otherwise: it is told in millimetres, not in standard errors. Depths are normal, one side.
+    Outliers are as deep at places that were seen well as at others. Their depth is therefore told
+    in millimetres and not in standard errors; it is half-normally distributed.
 
     Attributes
     ----------
     spread_mm
-        Root of their mean square; 0: none lies far off.
+        Root mean square of their depths; 0 where there are none.
     places
-        How many such places a scan has.
+        How many outliers a scan has.
     told_by
-        How many told the spread.
+        How many outliers the spread was estimated from.
     """
 
     spread_mm: float
@@ -48,9 +49,9 @@ class FarOff:
     told_by: float
 
     def log_expected(self, beyond_mm: Values) -> Values:
-        """(s,) logarithm of how many such places of a scan lie deeper than each.
+        """(s,) logarithm of how many outliers of a scan are expected beyond each depth.
 
-        A normal value whose spread is itself told by so many is distributed as Student's t.
+        Student's t, since the spread of the normal distribution is itself an estimate.
         """
         if not self.spread_mm:
             return np.full(len(beyond_mm), -np.inf)
@@ -59,30 +60,31 @@ class FarOff:
             return np.asarray(np.log(2.0 * self.places * stdtr(self.told_by, -ratio)))
 
     def exceeded_by(self, expected: float) -> float:
-        """Beyond which depth, mm, a scan has so many such places; 0 where it has fewer at all."""
+        """The depth, mm, beyond which so many outliers are expected; 0 if there are fewer."""
         share = 0.5 * min(expected / self.places, 1.0) if self.spread_mm else 0.5
         return -self.spread_mm * float(stdtrit(self.told_by, share)) if share < 0.5 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Errors of sound parts.
+    """The errors that a scanner and a printer leave on sound parts.
 
     Attributes
     ----------
     name, scans
-        What it is kept by, and how many scans of sound parts it was learned from.
+        The name that it is kept by, and how many scans of sound parts it was learned from.
     width_mm
-        (k,) widths of the windows that it knows.
+        (k,) widths of the windows for which errors are known.
     wander_mm, freedom
-        (k, c) standard deviation of window means, by width and by how well they were seen, the
-        best first, and its degrees of freedom.
+        (k, c) standard deviation of window means and the degrees of freedom of that estimate, for
+        each width and each class of how well windows were seen, the best first.
     far_off
-        Of three cells together, then of window medians by width: for side 0, missing, and 1,
-        excess, the spread in mm, places a window and places in all. In wide windows errors that
-        lie far off at one place fall out.
+        Outliers of three cells together, and then of window medians for each width. Each has a
+        pair, for missing and for excess, of: spread in mm, outliers a window, and how many the
+        spread was estimated from. In wide windows an outlier at one place drops out of the median.
     facing
-        Cosine of incidence down to which it tells; what is seen more aslant errs the more.
+        The smallest cosine of incidence that it was learned from. Surface seen more aslant is taken
+        to err more.
     """
 
     name: str
@@ -94,9 +96,9 @@ class Calibration:
     facing: float = 0.0
 
     def wander(self, width_mm: float, classes: int) -> tuple[Values, Values]:
-        """(c,) standard deviation of means of windows so wide, by class, 0 where none is known.
+        """(c,) standard deviation of the means of windows of a width, for each class.
 
-        And (c,) its degrees of freedom.
+        And (c,) its degrees of freedom. 0 where the calibration knows of no wander.
         """
         if not self.width_mm:
             return np.zeros(classes), np.full(classes, np.inf)
@@ -105,7 +107,7 @@ class Calibration:
         return np.array(self.wander_mm[row])[known], np.array(self.freedom[row])[known]
 
     def far_off_in(self, width_mm: float | None, side: int, windows: int) -> FarOff:
-        """What lies far off of so many windows; without a width, of three cells together."""
+        """The outliers of so many windows of a width; without a width, of three cells together."""
         if not self.far_off:
             return FarOff(0.0, 0.0, 0.0)
         row = 0 if width_mm is None else 1 + self._row(width_mm)
@@ -113,15 +115,15 @@ class Calibration:
         return FarOff(spread_mm, rate * windows, told_by)
 
     def _row(self, width_mm: float) -> int:
-        """The widest that is known and no wider, to half of what widths are told apart by.
+        """The row of the widest known width that is no wider than this one (to a quarter octave).
 
-        Narrower windows err more: what lies far off there fills part of a wider one.
+        Never a wider one: narrower windows err more, so that way an error is never underestimated.
         """
         as_wide = np.array(self.width_mm) <= width_mm * 2.0 ** (0.5 * HALF_OCTAVE)
         return max(int(as_wide.sum()) - 1, 0)
 
     def told(self) -> str:
-        """Whose errors they are, in a sentence."""
+        """Says by whose errors the scan was judged, in a sentence."""
         if self.name == BED_BESIDE:
             return (
                 f"Judged by what this scan shows of {BED_BESIDE}: its errors are not normal noise."
@@ -175,22 +177,22 @@ class Calibration:
 
 
 def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
-    """The errors of scans by touches: all that is said of one touch errs as that touch does.
+    """The errors of a scan made of touches: all points that stem from one touch err together.
 
     Parameters
     ----------
     sigma_mm
         Standard deviation of one touch.
     process_sigma_mm
-        By how much sound parts depart as a whole, which the test takes out of the wander.
+        By how much the surface of sound parts wanders, which the test subtracts again.
     """
     wander_mm = float(np.hypot(sigma_mm, process_sigma_mm))
     return Calibration("repeated touches", 1, (1.0,), ((wander_mm,),), ((np.inf,),))
 
 
-# What an own calibration of a scan by the bed in it is called.
+# The name of the calibration that a scan gets from the bed seen in it.
 BED_BESIDE = "the bed beside the part"
-# Independent normal errors and nothing else: what the simulated scanner leaves by default.
+# Independent normal errors and nothing else, as the simulated scanner has them by default.
 NORMAL_NOISE = Calibration("normal noise", 0)
 
 
@@ -213,5 +215,5 @@ def users_folder() -> Path:
 
 
 def as_tuples(value: Any) -> Any:
-    """What JSON keeps as lists, as it was."""
+    """Turn the lists of a JSON file back into tuples."""
     return tuple(as_tuples(item) for item in value) if isinstance(value, list) else value

@@ -18,11 +18,11 @@ import trimesh
 from amrepair.errors import InputError
 from amrepair.frames import Transform
 from amrepair.loop.looks import Stop, plan_stops
-from amrepair.loop.marks import marked_stops
+from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.options import LoopOptions
 from amrepair.loop.pace import Pace
 from amrepair.policy import USUAL_POLICY, PolicyOptions
-from amrepair.regions.calibration import Calibration, as_tuples
+from amrepair.regions.error_calibration import Calibration, as_tuples
 from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
 from amrepair.template.port import Template

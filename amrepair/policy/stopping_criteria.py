@@ -1,4 +1,7 @@
-"""When enough has been done at a stop: another pass would not help, or what is left may be left."""
+"""When to stop repairing at a stop of a job.
+
+Another pass is not worth it when the last one changed nearly nothing, or when little is left.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,12 @@ from amrepair.policy.options import USUAL_POLICY, PolicyOptions
 
 
 def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
-    """Whether the last repair changed next to nothing of what is missing."""
+    """Whether the last repair left nearly all of what was missing before it."""
     return left_mm3 > options.stuck_ratio * before_mm3
 
 
 def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
-    """Whether what is left is a small share of what was found: more passes would only add rims."""
+    """Whether little of what was found is left: a further pass would mostly add rims."""
     return left_mm3 <= options.little_ratio * found_mm3
 
 
@@ -23,17 +26,17 @@ def may_be_left(
     excess_before_mm3: float,
     options: PolicyOptions = USUAL_POLICY,
 ) -> bool:
-    """Whether a stop was left within tolerance.
+    """Whether what is left at a stop is within tolerance, so that the job may go on.
 
-    Nothing that is worth a repair is left, beyond a share of what was found; and no more than
-    that share stands out: a repair's own rims are not a new defect.
+    A share of the volume that was found may stay missing, and repairs may leave as much standing
+    out as rims. What stood out before the first repair, and still does, has a limit of its own.
 
     Parameters
     ----------
     found_mm3
-        Volume found missing in the job so far: a later look sees earlier repairs, too.
+        Volume found missing in the whole job so far, since a look also sees earlier repairs.
     missing_mm3, excess_mm3
-        What the last look found: worth a repair, and standing out.
+        What the last look found: missing and worth a repair, and standing out.
     excess_before_mm3
         What stood out before the first repair.
     """

@@ -11,7 +11,7 @@ import pytest
 import gcode
 from amrepair.cli.repairing import _suggestion
 from amrepair.errors import InputError
-from amrepair.turning import NAMED_TURNS, rank_turns, turns_named
+from amrepair.reorientation import NAMED_TURNS, rank_turns, turns_named
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField

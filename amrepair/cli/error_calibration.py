@@ -11,9 +11,9 @@ import numpy as np
 from amrepair.align import align
 from amrepair.errors import InputError
 from amrepair.regions import detect
-from amrepair.regions.calibrating import Sound, calibrated
-from amrepair.regions.calibration import file_of, users_folder
 from amrepair.regions.detection import judged_scales
+from amrepair.regions.error_calibration import file_of, users_folder
+from amrepair.regions.error_calibration_fit import Sound, calibrated
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import read_scan
 from amrepair.template import open_template
