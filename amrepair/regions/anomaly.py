@@ -13,7 +13,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
-from amrepair.regions.calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.calibration import Calibration
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.sites import Sites
@@ -169,7 +169,7 @@ class AnomalyMap:
         """What belongs to the whole part or to whole views, or was not judged, in sentences."""
         whole = () if self.nuisance is None else self.nuisance.told()
         by = self.calibration
-        judged = () if by is None or by == NORMAL_NOISE else (by.told(),)
+        judged = () if by is None or by.is_normal else (by.told(),)
         noise = self.noise
         unjudged = () if noise is None or not noise.too_sparse else (noise.told_sparse(),)
         return (*judged, *unjudged, *(one.told() for one in self.contradicting), *whole)

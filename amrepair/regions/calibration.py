@@ -93,6 +93,11 @@ class Calibration:
     far_off: tuple[tuple[FarOffTold, FarOffTold], ...] = ()
     facing: float = 0.0
 
+    @property
+    def is_normal(self) -> bool:
+        """Whether it tells of independent normal errors and of nothing else."""
+        return not self.width_mm and not self.far_off
+
     def wander(self, width_mm: float, classes: int) -> tuple[Values, Values]:
         """(c,) standard deviation of means of windows so wide, by class, 0 where none is known.
 
@@ -192,6 +197,8 @@ def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
 BED_BESIDE = "the bed beside the part"
 # Independent normal errors and nothing else: what the simulated scanner leaves by default.
 NORMAL_NOISE = Calibration("normal noise", 0)
+# The same, but seen, and not taken for granted.
+NORMAL_BY_BED = Calibration(f"normal noise, as {BED_BESIDE} shows", 0)
 
 
 def file_of(name: str, folder: Path) -> Path:

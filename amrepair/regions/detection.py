@@ -146,7 +146,7 @@ def _tested(
     # what errors leave in strips neither a scan nor a calibration tells: only where they are known
     # to be normal is there any
     strands = np.zeros(len(seen.surfels), bool)
-    if calibration == NORMAL_NOISE:
+    if calibration is not None and calibration.is_normal:
         strands = _strands(seen, sites, levels, options)
     tolerances_mm = tolerances(options, seen.template)
     labels, log_p = grown(
