@@ -343,6 +343,7 @@ def _from_guess(
         end_scale_mm=options.poses.scale_mm(sigma_mm),
         sigma_mm=sigma_mm,
         prior=prior,
+        max_iterations=options.guess.most_steps,
     )
     away = found.matrix @ np.linalg.inv(guess.matrix)
     centre = points.mean(axis=0) @ guess.matrix[:3, :3].T + guess.matrix[:3, 3]

@@ -421,6 +421,10 @@ class GuessOptions:
         Points can lie on the part this far beside its box, and from so far above the bed.
     start_scale_mm
         Of the loss.
+    most_steps
+        Where walls were laid too narrow or too low, both of their sides lie inside, and the pose
+        slides slowly along a shallow valley between them: looks that 60 steps had ended took 61 to
+        97.
     least_explained, least_if_within, as_wide
         Much of what is seen may be bed. Where no more stands out of the part than may
         (`least_of_rest`), and what is seen is as wide as it is (this share in X and in Y), the rest
@@ -434,6 +438,7 @@ class GuessOptions:
     beside_mm: float = 3.0
     above_bed_mm: float = 0.35
     start_scale_mm: float = 1.0
+    most_steps: int = 240
     least_explained: float = 0.5
     least_if_within: float = 0.2
     as_wide: float = 0.9

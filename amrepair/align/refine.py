@@ -70,6 +70,7 @@ def refine(
     end_scale_mm: float,
     sigma_mm: float,
     prior: Prior | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Refined:
     """Move a pose to the nearest minimum of Σ ρ(f(T x)).
 
@@ -92,6 +93,7 @@ def refine(
         end_scale_mm=end_scale_mm,
         sigma_mm=sigma_mm,
         prior=prior,
+        max_iterations=max_iterations,
     )[0]
 
 

@@ -22,6 +22,10 @@ class KindOptions:
         Walls are looked at off the bed and off the top's rim; the bed, off the part.
     below_layer_mm, layer_rim_mm
         So far under its floor, and within so much of the outline, a region lies at the rim.
+    over_bead
+        Of its width, to either side of its path: what is seen there is a bead's top, and no flank.
+    faced_by
+        Of a cloud without normals, so many points tell which way one faces.
     short_layers
         Less than this is what a layer's beads differ by themselves.
     warp_layers, lifted_layers, warp_share
@@ -74,6 +78,8 @@ class KindOptions:
     top_rim_mm: float = 1.2
     below_layer_mm: float = 0.7
     layer_rim_mm: float = 0.5
+    over_bead: float = 0.25
+    faced_by: int = 12
     short_layers: float = 0.3
     warp_layers: float = 1.0
     lifted_layers: float = 0.6

@@ -3,8 +3,9 @@
 What went wrong with the whole print comes first (it came off, layers are shifted, it curls up):
 then every region is of that. Then what went wrong with the flow, told from the last layer's beads
 in the order they were printed: too little from some bead on is a clog, where that tells more of
-them right than a region would, whichever lie beside one another; too little everywhere is
-under-extrusion. What is left has a place, and is told by its shape.
+them right than a region would, whichever lie beside one another, and than one level of the whole
+layer does; too little everywhere is under-extrusion. What is left has a place, and is told by its
+shape.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from amrepair.arrays import Box, Mask, Matrix, PlanePoints, Values, Vector
 from amrepair.frames import Transform, turned_rad
 from amrepair.loop.findings import matching
 from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
-from amrepair.loop.shapes import bead_way, last_beads, spread, tall_mm
+from amrepair.loop.shapes import bead_way, last_beads, over_last_beads, spread, tall_mm
 from amrepair.loop.shapes import chain as chain_of
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import RepairPlan, Site
+from amrepair.scans.facing import facing
 from gcode.meshes import box_of_solid
 from gcode.reader import Job
 
@@ -93,7 +95,7 @@ def typed(
         found = (_shifted(seen[1], layer_mm, options), _warped(seen[0], layer_mm, options))
         whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
     if whole is None and seen is not None and plan.deficit.regions and not repaired:
-        flow = _flow(seen[0], job, line, layer_mm, options)
+        flow = _flow(_laid(plan, job, line, seen[2], options), job, line, layer_mm, options)
     pieces = {
         Label.MISSING: plan.deficit.missing.decompose(),
         Label.EXCESS: plan.deficit.excess.decompose(),
@@ -137,8 +139,11 @@ def _sure(value: float, limit: float) -> float:
 
 def _surfaces(
     plan: RepairPlan, site: Site, options: KindOptions
-) -> tuple[_Surface, _Surface] | None:
-    """What was seen of the top, and of the walls; None where no evidence says how noisy it is."""
+) -> tuple[_Surface, _Surface, float] | None:
+    """What was seen of the top, and of the walls, and how high the bed seems to lie.
+
+    None where no evidence says how noisy it is.
+    """
     evidence = plan.anomaly.evidence
     if evidence is None or len(evidence.surfels) == 0:
         return None
@@ -163,7 +168,28 @@ def _surfaces(
     low = place[:, 2] < level_mm - options.high_wall_mm
     top = seen.part((outward[:, 2] > options.top_cosine) & high, options.most_points)
     walls = (np.abs(outward[:, 2]) < options.wall_cosine) & low
-    return top, seen.part(walls, options.most_points)
+    return top, seen.part(walls, options.most_points), bed_mm
+
+
+def _laid(plan: RepairPlan, job: Job, line: int, bed_mm: float, options: KindOptions) -> _Surface:
+    """What was seen over the last layer's beads, by how far it lies above or below their path.
+
+    Not by how far from what is planned: where a bead over open infill is low or gone, what is seen
+    there is the top of a lower one, which is where it should be. What a bead lacks is no more than
+    its height.
+    """
+    assert plan.anomaly.evidence is not None
+    placed, scan, most_mm = plan.build_from_template, plan.scan, plan.layer_height_mm
+    some = np.arange(0, len(scan), max(1, len(scan) // (4 * options.most_points)))
+    place = placed.apply(scan.points_mm[some])
+    over, above_mm = over_last_beads(place, job, line, share=options.over_bead)
+    faced = placed.rotate(facing(scan, some[over], neighbours=options.faced_by))
+    upward = faced[:, 2] if scan.normals is not None else np.abs(faced[:, 2])
+    up = upward > options.top_cosine  # noise spreads walls over their beads; undersides are none
+    over, above_mm = over[up], above_mm[up]
+    noise_mm = max(float(plan.anomaly.evidence.surfels.spread_mm), plan.scan.sigma_mm)
+    seen = _Surface(place[over], np.clip(above_mm - bed_mm, -most_mm, most_mm), faced[up], noise_mm)
+    return seen.part(np.ones(len(over), bool), options.most_points)
 
 
 def _came_off(
@@ -291,6 +317,7 @@ def _flow(
         options.clog_least < share < options.clog_most
         and _lasts(short[at:]) >= options.clog_lasts
         and wrong <= _apart(points[seen, :2], short, distance[seen, -1], options)
+        and _left_by_clog(low, at) < float(((low - low.mean()) ** 2).sum())
     ):
         return TypeGuess(DefectType.CLOG, 1.0 - wrong)
     if short.mean() > options.layer_share:
@@ -306,6 +333,16 @@ def _since(short: Mask) -> tuple[int, float]:
     wrong = np.cumsum(np.concatenate([[np.sum(~short)], np.where(short, 1, -1)]))
     at = int(np.argmin(wrong))
     return at, float(wrong[at]) / len(short)
+
+
+def _left_by_clog(low: Values, at: int) -> float:
+    """Sum of squares that a clog leaves: whole up to a place along the path, one level from there.
+
+    What one level of the whole layer leaves is to be held against it: a layer that lacks as a whole
+    lacks before that place, too.
+    """
+    before, after = low[:at], low[at:]
+    return float((before**2).sum() + ((after - after.mean()) ** 2).sum())
 
 
 def _lasts(short: Mask) -> float:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
-from amrepair.arrays import Box, PlanePoints, Points
+from amrepair.arrays import Box, Mask, PlanePoints, Points
 from gcode.reader import Job
 from gcode.stretches import in_turn, places_along
 
 CHAIN_MM = 4.0
 """Pieces nearer than this are one thing that noise has cut."""
 BEAD_STEP_MM = 0.6
+FINEST_STEP_MM = 0.05
 
 
 def chain(
@@ -90,9 +92,40 @@ def bead_way(job: Job, line: int, box_mm: Box) -> Float[np.ndarray, " 2"] | None
 
 def last_beads(job: Job, line: int) -> Points:
     """Places along the beads of the last layer before a line, as printed."""
+    pick = _of_last_layer(job, line)
+    return places_along(job.beads.start_mm[pick], job.beads.end_mm[pick], BEAD_STEP_MM)[0]
+
+
+def over_last_beads(
+    points_mm: Points, job: Job, line: int, *, share: float
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Which points lie over the middle of the last layer's beads, and how far above their path.
+
+    Parameters
+    ----------
+    points_mm
+        (n, 3) in the build frame.
+    share
+        Of a bead's width, from its path to either side.
+    """
+    beads, pick = job.beads, _of_last_layer(job, line)
+    width_mm = beads.width_mm[pick]
+    if not pick.any() or not len(points_mm):
+        return np.zeros(0, np.int64), np.zeros(0)
+    within_mm = share * width_mm
+    place_mm, owner = places_along(
+        beads.start_mm[pick], beads.end_mm[pick], max(float(within_mm.min()), FINEST_STEP_MM)
+    )
+    away_mm, nearest = cKDTree(place_mm[:, :2]).query(
+        points_mm[:, :2], distance_upper_bound=float(within_mm.max())
+    )
+    near = np.flatnonzero(np.isfinite(away_mm))
+    near = near[away_mm[near] <= within_mm[owner[nearest[near]]]]
+    return near, points_mm[near, 2] - place_mm[nearest[near], 2]
+
+
+def _of_last_layer(job: Job, line: int) -> Mask:
+    """The beads of the last layer before a line; none where none is of a layer yet."""
     beads = job.beads
-    done = beads.line < line
-    if not done.any() or beads.layer[done].max() < 0:
-        return np.zeros((0, 3))
-    pick = done & (beads.layer == beads.layer[done].max())
-    return places_along(beads.start_mm[pick], beads.end_mm[pick], BEAD_STEP_MM)[0]
+    done = (beads.line < line) & (beads.layer >= 0)
+    return done & (beads.layer == beads.layer[done].max(initial=-1))

@@ -13,7 +13,7 @@ from amrepair.field.as_built import Evidence
 from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance
 from amrepair.observe.views import Contradiction
-from amrepair.regions.error_calibration import NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.inspected import Inspected
 from amrepair.regions.noise import Noise
 from amrepair.regions.options import RegionOptions
@@ -171,7 +171,7 @@ class AnomalyMap:
         """Sentences on what belongs to the whole part or a whole view, or was not judged."""
         whole = () if self.nuisance is None else self.nuisance.told()
         by = self.calibration
-        judged = () if by is None or by == NORMAL_NOISE else (by.told(),)
+        judged = () if by is None or by.is_normal else (by.told(),)
         noise = self.noise
         unjudged = () if noise is None or not noise.too_sparse else (noise.told_sparse(),)
         return (*judged, *unjudged, *(one.told() for one in self.contradicting), *whole)

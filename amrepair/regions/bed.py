@@ -18,7 +18,7 @@ from amrepair.frames import cells_of, in_box
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import fit_nuisance
 from amrepair.observe.options import BackgroundOptions
-from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_BY_BED, Calibration
 from amrepair.regions.error_calibration_fit import (
     NONE_FAR_OFF,
     Sound,
@@ -58,7 +58,7 @@ def by_beds(beds: Sequence[Sound], options: RegionOptions) -> Calibration:
     -------
     Calibration
         How far window means wander and how what lies too low falls off, for too low and too high
-        alike; `NORMAL_NOISE` where there is neither.
+        alike; `NORMAL_BY_BED` where there is neither.
     """
     found = calibrated(BED_BESIDE, beds, options)
     # the process leaves nothing there: of a part the test takes so much out
@@ -68,7 +68,7 @@ def by_beds(beds: Sequence[Sound], options: RegionOptions) -> Calibration:
         for told, alike in zip(found.wander_mm, by_width(beds).values(), strict=True)
     )
     if usual and all(low == NONE_FAR_OFF for low, _ in found.far_off):
-        return NORMAL_NOISE
+        return NORMAL_BY_BED
     both = [
         _and_process(*told, process_mm) for told in zip(found.wander_mm, found.freedom, strict=True)
     ]

@@ -144,7 +144,7 @@ def _tested(
     # neither a scan nor a calibration tells what errors look like in narrow strips, so strands are
     # looked for only where errors are known to be normal
     strands = np.zeros(len(seen.surfels), bool)
-    if calibration == NORMAL_NOISE:
+    if calibration is not None and calibration.is_normal:
         strands = _strands(seen, inspected, levels, options)
     tolerances_mm = tolerances(options, seen.template)
     labels, log_p = grown(

@@ -95,6 +95,11 @@ class Calibration:
     far_off: tuple[tuple[FarOffTold, FarOffTold], ...] = ()
     facing: float = 0.0
 
+    @property
+    def is_normal(self) -> bool:
+        """Whether it tells of independent normal errors and of nothing else."""
+        return not self.width_mm and not self.far_off
+
     def wander(self, width_mm: float, classes: int) -> tuple[Values, Values]:
         """(c,) standard deviation of the means of windows of a width, for each class.
 
@@ -194,6 +199,8 @@ def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:
 BED_BESIDE = "the bed beside the part"
 # Independent normal errors and nothing else, as the simulated scanner has them by default.
 NORMAL_NOISE = Calibration("normal noise", 0)
+# The same, but seen, and not taken for granted.
+NORMAL_BY_BED = Calibration(f"normal noise, as {BED_BESIDE} shows", 0)
 
 
 def file_of(name: str, folder: Path) -> Path:

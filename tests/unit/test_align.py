@@ -132,6 +132,39 @@ def lying_plate(size_mm: tuple[float, float, float]) -> Scan:
     return Scan(points + rng.normal(size=points.shape) * 0.03, 0.03, "scanner")
 
 
+def narrow_walls(height_mm: float, *, narrower_mm: float, from_mm: float) -> trimesh.Trimesh:
+    """Walls 0.9 mm wide that meet in a corner; from some height on they are narrower."""
+    solids = []
+    for inset_mm, up_mm in ((0.0, from_mm), (narrower_mm, height_mm)):
+        for x, y in ((30.0, 0.9), (0.9, 14.0)):
+            wall = trimesh.creation.box((x - 2 * inset_mm, y - 2 * inset_mm, up_mm))
+            wall.apply_translation((0.5 * x, 0.5 * y, 0.5 * up_mm))
+            solids.append(wall)
+    return trimesh.boolean.union(solids, engine="manifold")
+
+
+def test_walls_that_were_laid_narrower_leave_a_pose() -> None:
+    # regression: both sides of each wall lie inside, so that the pose slides slowly along a shallow
+    # valley; after 60 steps a look "did not converge", and two of them ended the run
+    planned = MeshSdf.from_mesh(narrow_walls(2.6, narrower_mm=0.0, from_mm=2.6))
+    built = narrow_walls(2.3, narrower_mm=0.15, from_mm=0.78)
+    steps = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        points, faces = trimesh.sample.sample_surface(built, 8000, seed=seed)
+        points = np.array(points)[built.face_normals[faces][:, 2] > -0.9]
+        bed = np.column_stack([rng.uniform(-20.0, 50.0, (5000, 2)), np.zeros(5000)])
+        seen = np.concatenate([points, bed[planned.distance(bed) > 0.5]])
+        seen += 0.03 * rng.normal(size=seen.shape)
+        guess = pose(4, turn_rad=0.002, shift_mm=0.1)
+        found = align(Scan(seen, 0.03, "scanner"), planned, guess=guess)
+        truth = Transform.identity("template", "scanner")
+        # on one side of each wall or the other, or between them
+        assert worst_mm(found.template_from_scan, truth, points) < 0.25
+        steps.append(found.iterations)
+    assert max(steps) > 60
+
+
 def test_layers_that_lack_half_of_their_plastic_are_no_other_part() -> None:
     # regression: a look at a low part whose last three layers lay 0.45 mm too low ended the run,
     # "the scan does not fit its template: 31% of its points lie within 0.3 mm"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,9 +23,13 @@ from amrepair.loop.shapes import last_beads
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import plan_repair
+from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.meshes import box_of_solid, mesh_of
+from gcode.moves import Program
 from gcode.profiles import load_setup
+from gcode.reader import read_job
+from gcode.stretches import places_along
 from gcode.surfaces import HeightField
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_kinds.py"
@@ -337,3 +342,66 @@ def test_what_hangs_below_an_overhang_has_sagged(
     plan = SimpleNamespace(build_from_template=placed)
     piece = piece.translate((50.0, 60.0, 0.0))
     assert kinds._hangs(piece, plan, site, USUAL_KINDS) == hangs  # type: ignore[arg-type]
+
+
+def rows_of_lines(layers: int) -> str:
+    """Layers of a wall around lines 4 mm apart, along X and along Y in turn; lines come first."""
+    text = ["G21", "G90", "M82", "G92 E0"]
+    e_mm, per_mm = 0.0, 0.45 * 0.2 / (np.pi / 4 * 1.75**2)
+    for layer in range(layers):
+        text += [";LAYER_CHANGE", f"G1 Z{0.2 * (layer + 1):.3f} F600"]
+        ends = [((k, 1.0), (k, 19.0)) for k in np.arange(2.0, 20.0, 4.0)]
+        lines = [(a[::-1], b[::-1]) if layer % 2 else (a, b) for a, b in ends]
+        corners = [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0), (0.0, 0.0)]
+        for start, end in [*lines, *itertools.pairwise(corners)]:
+            e_mm += per_mm * float(np.hypot(*np.subtract(end, start)))
+            text += [f"G1 X{50 + start[0]:.3f} Y{50 + start[1]:.3f} F6000",
+                     f"G1 X{50 + end[0]:.3f} Y{50 + end[1]:.3f} E{e_mm:.5f} F1200"]  # fmt: skip
+    return "\n".join(text) + "\n"
+
+
+@pytest.mark.parametrize("bare", [True, False])
+def test_a_layer_of_sparse_lines_that_lacks_as_a_whole_is_no_clog(bare: bool) -> None:
+    # regression: between the lines below, where a line was low or gone, the top of the layer below
+    # was taken for it, which lay where it should: lines first and walls last, a layer laid with
+    # half of its plastic was short "from the walls on", and the run ended as clogged
+    job = read_job(Program(rows_of_lines(8), "marlin"), dialect="marlin")
+    rng = np.random.default_rng(0)
+    beads, points = job.beads, []
+    for layer in (6, 7):
+        pick = beads.layer == layer
+        step = places_along(beads.start_mm[pick], beads.end_mm[pick], 0.1)[0]
+        points.append(step + rng.uniform(-0.2, 0.2, step.shape) * [1.0, 1.0, 0.0])
+    points[1][:, 2] -= 0.25  # below the last layer, over the one before it
+    cloud = np.concatenate(points)
+    cloud[:, 2] += rng.normal(0.0, 0.02, len(cloud))
+    normals = None if bare else np.tile([0.0, 0.0, 1.0], (len(cloud), 1))
+    plan = SimpleNamespace(
+        build_from_template=Transform.identity("build", "template"), layer_height_mm=0.2,
+        scan=Scan(cloud, 0.02, "template", normals),
+        anomaly=SimpleNamespace(evidence=SimpleNamespace(surfels=SimpleNamespace(spread_mm=0.02))),
+    )  # fmt: skip
+    last = len(rows_of_lines(8).splitlines())
+    seen = kinds._laid(plan, job, last, 0.0, USUAL_KINDS)  # type: ignore[arg-type]
+    found = kinds._flow(seen, job, last, 0.2, USUAL_KINDS)
+    assert found is not None
+    assert found.type is DefectType.UNDER_EXTRUSION
+
+
+def test_a_layer_that_is_low_all_along_is_no_clog(bench: ModuleType, scene) -> None:  # type: ignore[no-untyped-def]
+    # regression: two sound layers over three that lacked half of their plastic lay half a layer
+    # low, the walls of a dome a little lower than its skin: said to be clogged from the walls on
+    job, stop, _, _ = scene
+    points = last_beads(job, stop.line)
+    rng = np.random.default_rng(0)
+    late = np.arange(len(points)) > 0.7 * len(points)
+
+    def found(before: float, after: float) -> DefectType | None:
+        low = np.where(late, after, before) + rng.normal(0.0, 0.15, len(points))
+        up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        seen = kinds._Surface(points, -0.2 * low, up, 0.02)
+        guess = kinds._flow(seen, job, stop.line, 0.2, USUAL_KINDS)
+        return None if guess is None else guess.type
+
+    assert found(0.35, 0.57) is DefectType.UNDER_EXTRUSION
+    assert found(0.0, 1.0) is DefectType.CLOG

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from amrepair.regions.bed import by_beds, of_bed
-from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_NOISE, Calibration
+from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_BY_BED, Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 
@@ -49,11 +49,11 @@ def told(*looks: np.ndarray, options: RegionOptions = OPTIONS) -> Calibration | 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_bed_with_normal_noise_says_so(seed: int) -> None:
     points = bed(seed)
-    assert told(points) == NORMAL_NOISE
+    assert told(points) == NORMAL_BY_BED
     # a skirt, as high as a thick first layer, lies on the bed and is no error of the scanner's
     skirt = np.abs(points[:, 0] + 5.0) < 0.4
     points[skirt, 2] += 0.3
-    assert told(points) == NORMAL_NOISE
+    assert told(points) == NORMAL_BY_BED
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -86,13 +86,13 @@ def test_the_more_looks_show_the_bed_the_surer_it_tells() -> None:
     assert many.told_by > few.told_by
     assert many.exceeded_by(0.005) / many.spread_mm < few.exceeded_by(0.005) / few.spread_mm
     # a look that shows nothing far off is one of a scanner that did
-    assert told(beds[0], bed(9)) != NORMAL_NOISE
+    assert told(beds[0], bed(9)) != NORMAL_BY_BED
 
 
 def test_what_lies_on_the_bed_is_no_error_of_the_scanners() -> None:
     points = bed(0)
     points[:, 2] += np.abs(patches(points, 0))
-    assert told(points) == NORMAL_NOISE
+    assert told(points) == NORMAL_BY_BED
 
 
 def test_errors_that_hang_together_are_told_by_how_far_windows_wander() -> None:
@@ -112,7 +112,7 @@ def test_a_part_that_is_as_yet_no_higher_than_the_bed_s_errors_is_none_of_it() -
     foot = rng.uniform(PART_MM[0, :2], PART_MM[1, :2], (20_000, 2))
     holed = np.where((np.floor(foot) % 4 == 0).all(axis=1), -0.6, 0.0)  # pits all over
     first_layers = np.column_stack([foot, 0.6 + holed + rng.normal(0.0, SIGMA_MM, len(foot))])
-    assert told(np.concatenate([points, first_layers])) == NORMAL_NOISE
+    assert told(np.concatenate([points, first_layers])) == NORMAL_BY_BED
     assert told(first_layers) is None
 
 
@@ -131,4 +131,4 @@ def test_what_stands_on_the_bed_and_what_lies_beyond_its_rim_is_none_of_it() -> 
     points[beyond, 2] -= 4.0
     for apart_mm in (1.0, 0.0):  # none apart: cells that nothing stands in are bed, not none at all
         background = replace(OPTIONS.background, bed_apart_mm=apart_mm)
-        assert told(points, options=replace(OPTIONS, background=background)) == NORMAL_NOISE
+        assert told(points, options=replace(OPTIONS, background=background)) == NORMAL_BY_BED
