@@ -96,7 +96,8 @@ def _as_seen(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask
 
     What hides a part of the surface hides all of it at once, so that no number of unseen places is
     evidence of a void. A void that takes an area M of the template's surface has a broken edge: if
-    it goes right through, around M/2, at least as long as a circle's and a bead thick.
+    it goes right through, around M/2, at least as long as a circle's and a bead thick. Where it
+    meets what stands in less than that, as half of a frame does, that much was broken.
     """
     found, designed = solid.copy(), grid.f_mm < 0
     index, ok = voxels_at(scan.broken.place_mm, grid.low_mm, grid.voxel_mm, solid.shape)
@@ -115,7 +116,13 @@ def _as_seen(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask
                     mouth += ~np.roll(designed, way, axis=axis)
             mouth_mm2 = np.bincount(groups[differs], mouth[differs], count + 1) * grid.voxel_mm**2
             around_mm = 2.0 * np.sqrt(np.pi * 0.5 * mouth_mm2)
-            least_mm2 = scan.options.least_seen * scan.options.bead_mm * around_mm
+            ends = np.zeros(solid.shape, np.int64)
+            for _, index, _ in _facets_toward(differs, designed & solid, grid):
+                ends[tuple(index.T)] += 1
+            end_mm2 = np.bincount(groups[differs], ends[differs], count + 1) * grid.voxel_mm**2
+            least_mm2 = scan.options.least_seen * np.minimum(
+                scan.options.bead_mm * around_mm, end_mm2
+            )
         alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
     return found
