@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from amrepair.errors import InputError
-from amrepair.simulate.options import USUAL_RECORDING
+from amrepair.simulate.options import DEFAULT_RECORDING
 from amrepair.simulate.recording import (
     PITCH_MM,
     RECORDING_VERSION,
@@ -70,7 +70,7 @@ def record(views: Sequence[ViewResiduals], *, source: str) -> Recording:
     for view in views:
         offset = view_offset_mm(view.normals, view.deviation_mm)
         residual = view.deviation_mm - view.normals @ offset
-        residual[np.abs(residual) > USUAL_RECORDING.farthest_mm] = np.nan
+        residual[np.abs(residual) > DEFAULT_RECORDING.farthest_mm] = np.nan
         edge = edge_distance_mm(view.points_mm[:, :2], view.points_mm[:, 2], 2.0 * pitch)
         cosine = np.clip(view.normals[:, 2], 0.0, 1.0)
         offsets.append(offset)
@@ -85,7 +85,7 @@ def record(views: Sequence[ViewResiduals], *, source: str) -> Recording:
 
 def view_offset_mm(normals: np.ndarray, deviation_mm: np.ndarray) -> np.ndarray:
     """(3,) the shift that explains most of a view's deviations: least squares, outliers cut."""
-    use = np.isfinite(deviation_mm) & (np.abs(deviation_mm) < USUAL_RECORDING.farthest_mm)
+    use = np.isfinite(deviation_mm) & (np.abs(deviation_mm) < DEFAULT_RECORDING.farthest_mm)
     shift = np.zeros(3)
     for _ in range(5):
         left = deviation_mm - normals @ shift

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from amrepair.align.anywhere import Found, explained_if_mirrored, pose_from_anywhere
 from amrepair.align.bed import bed_prior, level_on_bed
-from amrepair.align.options import USUAL_ALIGN, AlignOptions
+from amrepair.align.options import DEFAULT_ALIGN, AlignOptions
 from amrepair.align.pam import align_paper
 from amrepair.align.poses import explained
 from amrepair.align.refine import Prior, Refined, refine
@@ -55,7 +55,7 @@ def align(
     so_far: SoFar | None = None,
     aside: Aside | None = None,
     part_is_known: bool = False,
-    options: AlignOptions = USUAL_ALIGN,
+    options: AlignOptions = DEFAULT_ALIGN,
     rng: np.random.Generator | None = None,
     progress: Progress = silent,
 ) -> Registration:

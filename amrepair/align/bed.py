@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from amrepair.align.options import USUAL_ALIGN, BedOptions
+from amrepair.align.options import DEFAULT_ALIGN, BedOptions
 from amrepair.align.refine import Prior
 from amrepair.arrays import Matrix, Points
 from amrepair.frames import moved, rigid, rotation_from_vector
@@ -15,7 +15,7 @@ from amrepair.template.port import Template
 
 
 def level_on_bed(
-    points_mm: Points, template: Template, matrix: Matrix, options: BedOptions = USUAL_ALIGN.bed
+    points_mm: Points, template: Template, matrix: Matrix, options: BedOptions = DEFAULT_ALIGN.bed
 ) -> tuple[Matrix, bool]:
     """Correct a guess so that the bed that the scan shows lies where the template's foot stands.
 
@@ -67,7 +67,7 @@ def level_on_bed(
 def bed_prior(
     rotation_sigma_rad: float,
     translation_sigma_mm: float,
-    options: BedOptions = USUAL_ALIGN.bed,
+    options: BedOptions = DEFAULT_ALIGN.bed,
 ) -> Prior:
     """The guess's own spread, but for height and tilt, which the bed has fixed."""
     return Prior(

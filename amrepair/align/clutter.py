@@ -14,7 +14,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
-from amrepair.align.options import USUAL_ALIGN, ClutterOptions
+from amrepair.align.options import DEFAULT_ALIGN, ClutterOptions
 from amrepair.arrays import Mask, Points, Values
 from amrepair.frames import diagonal
 
@@ -39,7 +39,7 @@ class Kept:
 
 
 def without_clutter(
-    points_mm: Points, rng: np.random.Generator, options: ClutterOptions = USUAL_ALIGN.clutter
+    points_mm: Points, rng: np.random.Generator, options: ClutterOptions = DEFAULT_ALIGN.clutter
 ) -> list[Kept]:
     """What may be the part, least left out first; empty where there is no clutter to tell.
 
@@ -77,7 +77,7 @@ def without_clutter(
 
 
 def noise_across(
-    points_mm: Points, rng: np.random.Generator, options: ClutterOptions = USUAL_ALIGN.clutter
+    points_mm: Points, rng: np.random.Generator, options: ClutterOptions = DEFAULT_ALIGN.clutter
 ) -> float:
     """Noise across the surface, mm: what quadrics through nearby points leave.
 

@@ -580,5 +580,5 @@ class AlignOptions:
     paper: PamOptions = PUBLISHED_PAM
 
 
-USUAL_ALIGN = AlignOptions()
+DEFAULT_ALIGN = AlignOptions()
 """What the loop and the command line go by."""

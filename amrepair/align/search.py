@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.align import search_kernels as kernels
-from amrepair.align.options import USUAL_ALIGN, CoarseOptions, Effort
+from amrepair.align.options import DEFAULT_ALIGN, CoarseOptions, Effort
 from amrepair.align.thinning import Thinned
 from amrepair.arrays import Box, Matrix, Points, Vector, Voxels
 from amrepair.frames import grid_points, nearest_rotation, rigid, rotation_of_quaternion
@@ -48,7 +48,7 @@ class CoarseField:
     options: CoarseOptions
 
     @classmethod
-    def of(cls, template: Template, options: CoarseOptions = USUAL_ALIGN.coarse) -> CoarseField:
+    def of(cls, template: Template, options: CoarseOptions = DEFAULT_ALIGN.coarse) -> CoarseField:
         """Ask the template at every node; the last one's answers are kept for its next scan."""
         for known, field in _latest:
             if known is template and field.options == options:

@@ -24,12 +24,14 @@ from amrepair.align.search import CoarseField, search
 from amrepair.align.thinning import Thinned
 from amrepair.arrays import Mask, Points, Values, Vector
 from amrepair.bench.bends import Pieces, Pose, best_cuts, with_zone
-from amrepair.bench.options import USUAL_BODIES, BodyOptions
+from amrepair.bench.options import DEFAULT_BODIES, BodyOptions
 from amrepair.frames import diagonal, moved, rigid, rotation_from_vector, unit_vectors, ways_across
 from amrepair.template.port import Template
 
 
-def surface_of(template: Template, options: BodyOptions = USUAL_BODIES) -> Float[np.ndarray, "m 3"]:
+def surface_of(
+    template: Template, options: BodyOptions = DEFAULT_BODIES
+) -> Float[np.ndarray, "m 3"]:
     """(m, 3) places of a template's surface, as dense as bends are judged."""
     return template.surface_points(options.surface_ratio * diagonal(template.bounds_mm))[0]
 
@@ -41,7 +43,7 @@ def pieces_of(
     sigma_mm: float,
     rng: np.random.Generator,
     surface_mm: Float[np.ndarray, "m 3"] | None = None,
-    options: BodyOptions = USUAL_BODIES,
+    options: BodyOptions = DEFAULT_BODIES,
 ) -> Pieces:
     """The larger piece's pose, and the other's, where the scan shows a part bent in two.
 

@@ -24,7 +24,7 @@ from amrepair.arrays import Matrix, Points, Values
 from amrepair.bench.bodies import pieces_of, surface_of
 from amrepair.bench.method import DIAGONAL_MM, ClassInput, Model, Scores
 from amrepair.bench.metrics import CloudDistance, cloud_distance
-from amrepair.bench.options import USUAL_HOUSE
+from amrepair.bench.options import DEFAULT_HOUSE
 from amrepair.bench.sound_test import SoundTest, SoundTestOptions
 from amrepair.errors import AlignmentError
 from amrepair.frames import diagonal, moved
@@ -89,7 +89,7 @@ def _from_clouds(data: ClassInput, seed: int) -> GridSdf:
         for cloud, pose in zip(data.clouds_mm, made.poses, strict=True)
         if pose is not None
     ]
-    for _ in range(USUAL_HOUSE.learning_rounds):
+    for _ in range(DEFAULT_HOUSE.learning_rounds):
         template, _ = learn(template, placed)
     return template
 
@@ -99,7 +99,7 @@ def _laid(
 ) -> list[Matrix]:
     """Poses of points in the template, the best first; a failed alignment is tried again."""
     scan = Scan(points_mm, sigma_mm, "scanner", source="sample")
-    for left in reversed(range(USUAL_HOUSE.retries)):
+    for left in reversed(range(DEFAULT_HOUSE.retries)):
         try:
             found = align(scan, template, part_is_known=True, rng=rng)
             break
@@ -121,12 +121,12 @@ def repair_distance(
     """
     if data.mesh is None:
         return None
-    made = extract_mesh(template, USUAL_HOUSE.surface_spacing_mm)
+    made = extract_mesh(template, DEFAULT_HOUSE.surface_spacing_mm)
     first, second = (
         sample_surface(
             np.asarray(mesh.vertices),
             np.asarray(mesh.faces),
-            count=USUAL_HOUSE.repair_points,
+            count=DEFAULT_HOUSE.repair_points,
             offset=float(rng.random()),
         )[0]
         for mesh in (made, data.mesh)
@@ -150,19 +150,19 @@ def smoothed_score(points_mm: Points, offset_mm: Values, sigma_mm: Values) -> Va
 
     In standard deviations `sigma_mm` of what sound parts leave there.
     """
-    limit_mm = USUAL_HOUSE.most_offset_ratio * diagonal(points_mm)
+    limit_mm = DEFAULT_HOUSE.most_offset_ratio * diagonal(points_mm)
     order = order_of(points_mm)  # near points in a row are found sooner
     points = points_mm[order]
     offset = (np.clip(offset_mm, -limit_mm, limit_mm) / sigma_mm)[order]
-    count = min(USUAL_HOUSE.near_neighbours, len(points))
+    count = min(DEFAULT_HOUSE.near_neighbours, len(points))
     tree = cKDTree(points, balanced_tree=False)
     index = tree.query(points, k=[*range(1, count + 1)], workers=-1)[1]
     near = np.abs(offset[index].mean(axis=1))
     wide = near
-    for _ in range(USUAL_HOUSE.wide_passes):
+    for _ in range(DEFAULT_HOUSE.wide_passes):
         wide = wide[index].mean(axis=1)
     score = np.empty(len(points))
-    score[order] = near + USUAL_HOUSE.wide_weight * wide
+    score[order] = near + DEFAULT_HOUSE.wide_weight * wide
     return score
 
 
@@ -184,15 +184,15 @@ class FieldModel:
             return Scores(np.zeros(len(points_mm)), np.inf, None, aligned=False)
         placed = moved(points_mm, known[0])
         seen = self.sound.look(placed)
-        followed = seen.followed(USUAL_HOUSE.followed_ratio * DIAGONAL_MM)
-        some = points_mm[followed] if followed.mean() > USUAL_HOUSE.least_followed else points_mm
+        followed = seen.followed(DEFAULT_HOUSE.followed_ratio * DIAGONAL_MM)
+        some = points_mm[followed] if followed.mean() > DEFAULT_HOUSE.least_followed else points_mm
         pieces = pieces_of(some, self.template, known, self.sigma_mm, rng, self.surface_mm)
         if not np.array_equal(pieces.pose, known[0]):
             placed = moved(points_mm, pieces.pose)
             seen = self.sound.look(placed)
         judged = self.sound.judge(placed, seen)
         # Published clouds may have no noise at all; the unit does not matter then.
-        least_mm = USUAL_HOUSE.least_sigma_ratio * DIAGONAL_MM
+        least_mm = DEFAULT_HOUSE.least_sigma_ratio * DIAGONAL_MM
         sigma_mm = np.maximum(judged.sigma_mm, least_mm)
         score = smoothed_score(placed, judged.off_mm, sigma_mm)
         aside = pieces.moved_mm(points_mm) / max(self.sigma_mm, least_mm)

@@ -169,7 +169,7 @@ class BodyOptions:
     bends: BendOptions = BendOptions()
 
 
-USUAL_BODIES = BodyOptions()
+DEFAULT_BODIES = BodyOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +203,7 @@ class LabelOptions:
     looseness: float = 0.6
 
 
-USUAL_LABELS = LabelOptions()
+DEFAULT_LABELS = LabelOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +245,7 @@ class MakingOptions:
     least_smooth_ratio: float = 0.02
 
 
-USUAL_MAKING = MakingOptions()
+DEFAULT_MAKING = MakingOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ class ViewingOptions:
     density_log: float = 1.5
 
 
-USUAL_VIEWING = ViewingOptions()
+DEFAULT_VIEWING = ViewingOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,4 +320,4 @@ class HouseOptions:
     learning_rounds: int = 2
 
 
-USUAL_HOUSE = HouseOptions()
+DEFAULT_HOUSE = HouseOptions()

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from amrepair.arrays import Matrix, Points, Vector
-from amrepair.bench.options import USUAL_LABELS, USUAL_MAKING
+from amrepair.bench.options import DEFAULT_LABELS, DEFAULT_MAKING
 from amrepair.bench.samples import Format, SampleCloud
 from amrepair.bench.synth_defects import Part, Size, SynthDefect, damage, make_part
 from amrepair.bench.synth_views import (
@@ -40,7 +40,7 @@ SIGMA_RATIO = 5e-4
 SINGLE_VIEW_RATIO = {Format.SHAPENET: 1 / 3, Format.REAL3D: 2 / 3}
 FIRST_NUMBER = 101  # Real3D-AD names start with a running number
 # Width of the smallest bulges of the data sets' own size.
-USUAL_RATIO = 2 * USUAL_MAKING.bulge_ratio[0]
+USUAL_RATIO = 2 * DEFAULT_MAKING.bulge_ratio[0]
 REAL3D_WORDS = {SynthDefect.CONCAVITY: "sink"}
 
 
@@ -279,17 +279,17 @@ def _side(shape: Shape, rng: np.random.Generator) -> Vector:
     """A direction to look from: any for a normal part, towards the defect for a damaged one."""
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    points = sample_shape(shape, USUAL_LABELS.side_points, rng)
+    points = sample_shape(shape, DEFAULT_LABELS.side_points, rng)
     changed = points.take(points.change_mm > 0)
     if len(changed.points_mm):
         outward = changed.normals.mean(axis=0)
         length = float(np.linalg.norm(outward))
-        direction = outward / max(length, 1e-9) + USUAL_LABELS.looseness * direction
+        direction = outward / max(length, 1e-9) + DEFAULT_LABELS.looseness * direction
     return direction
 
 
 def _labels(surface: SeenSurface, sigma_mm: float) -> np.ndarray:
-    return (surface.change_mm > USUAL_LABELS.visible_sigmas * sigma_mm).astype(np.int64)
+    return (surface.change_mm > DEFAULT_LABELS.visible_sigmas * sigma_mm).astype(np.int64)
 
 
 def _defective(
@@ -302,7 +302,7 @@ def _defective(
     single: bool,
 ) -> _Made:
     """A defect that the view shows; another place or view is drawn until it does."""
-    for attempt in range(USUAL_LABELS.most_views):
+    for attempt in range(DEFAULT_LABELS.most_views):
         size = options.size(rng)
         shape = damage(part, defect, rng, size)
         made = _made(
@@ -312,20 +312,20 @@ def _defective(
             rng,
             kind=str(defect),
             index=index,
-            single=single and attempt < USUAL_LABELS.most_single_views,
+            single=single and attempt < DEFAULT_LABELS.most_single_views,
         )
         labels = made.cloud.labels
         # The share that a view must show falls with the defect's surface.
         need = max(
-            USUAL_LABELS.least_labelled,
-            USUAL_LABELS.least_labelled_ratio * size.scale**2 * len(labels),
+            DEFAULT_LABELS.least_labelled,
+            DEFAULT_LABELS.least_labelled_ratio * size.scale**2 * len(labels),
         )
-        if labels.sum() >= need and 1.0 - labels.mean() >= USUAL_LABELS.least_normal_ratio:
+        if labels.sum() >= need and 1.0 - labels.mean() >= DEFAULT_LABELS.least_normal_ratio:
             return made
     raise InputError(
-        f"no view of a {defect} on this part showed {USUAL_LABELS.least_labelled_ratio:.1%} of "
-        f"its points and {USUAL_LABELS.least_normal_ratio:.0%} beside it in "
-        f"{USUAL_LABELS.most_views} tries; ask for more points or leave the part out"
+        f"no view of a {defect} on this part showed {DEFAULT_LABELS.least_labelled_ratio:.1%} of "
+        f"its points and {DEFAULT_LABELS.least_normal_ratio:.0%} beside it in "
+        f"{DEFAULT_LABELS.most_views} tries; ask for more points or leave the part out"
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Values, Vector, Vertices
-from amrepair.bench.options import USUAL_MAKING
+from amrepair.bench.options import DEFAULT_MAKING
 from amrepair.bench.synth_views import Rays, SeenSurface, Shape, sample_shape, sensors_around
 from amrepair.errors import InputError
 from gcode.meshes import mesh_of
@@ -68,7 +68,7 @@ def make_part(vertices_mm: Vertices, faces: np.ndarray, rng: np.random.Generator
     solid = as_manifold(vertices_mm, faces).as_original()
     shape = Shape(vertices_mm, faces, np.zeros((len(faces), 3)))
     rays = Rays(shape)
-    points = sample_shape(shape, USUAL_MAKING.seed_points, rng)
+    points = sample_shape(shape, DEFAULT_MAKING.seed_points, rng)
     seen = points.take(rays.seen(points, sensors_around(shape)))
     if len(seen.points_mm) == 0:
         raise InputError("no point of the part can be seen from outside; is it inside out?")
@@ -103,14 +103,14 @@ def damage(part: Part, defect: SynthDefect, rng: np.random.Generator, size: Size
         If no place on the part takes this defect.
     """
     make = _MAKERS[defect]
-    for _ in range(USUAL_MAKING.attempts):
+    for _ in range(DEFAULT_MAKING.attempts):
         i = int(rng.integers(len(part.thickness_mm)))
         seed = Seed(part.seeds.points_mm[i], part.seeds.normals[i], float(part.thickness_mm[i]))
         shape = make(part, seed, rng, size)
         if shape is not None and (shape.change_mm > 0).any():
             return shape
     raise InputError(
-        f"no place for a {defect} was found on the part in {USUAL_MAKING.attempts} tries; "
+        f"no place for a {defect} was found on the part in {DEFAULT_MAKING.attempts} tries; "
         "it may be too thin: leave the part out"
     )
 
@@ -124,8 +124,8 @@ def _frame(seed: Seed, rng: np.random.Generator) -> Float[np.ndarray, "3 4"]:
 
 def _waves(rng: np.random.Generator, frequency: float) -> Callable[[np.ndarray], np.ndarray]:
     """A smooth random function of (n, 3) points, about −1…1: a few plane waves."""
-    k = frequency * rng.normal(size=(USUAL_MAKING.waves, 3))
-    phase = rng.uniform(0, 2 * np.pi, USUAL_MAKING.waves)
+    k = frequency * rng.normal(size=(DEFAULT_MAKING.waves, 3))
+    phase = rng.uniform(0, 2 * np.pi, DEFAULT_MAKING.waves)
     return lambda x: np.sin(x @ k.T + phase).mean(axis=1) * 2.0
 
 
@@ -151,11 +151,11 @@ def _result(part: Part, solid: Any) -> Shape | None:
 
 
 def _bulge(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
-    radius_mm = size.scale * rng.uniform(*USUAL_MAKING.bulge_ratio) * part.diagonal_mm
+    radius_mm = size.scale * rng.uniform(*DEFAULT_MAKING.bulge_ratio) * part.diagonal_mm
     height_mm = rng.uniform(0.35, 0.7) * radius_mm
     if size.smooth:
         return _swelling(part, seed, radius_mm, height_mm)
-    if seed.thickness_mm < USUAL_MAKING.least_thickness_ratio * part.diagonal_mm:
+    if seed.thickness_mm < DEFAULT_MAKING.least_thickness_ratio * part.diagonal_mm:
         return None
     # The lump's lower half stays inside the material, or the far side would bulge, too.
     floor_mm = min(height_mm, 0.9 * seed.thickness_mm)
@@ -164,9 +164,9 @@ def _bulge(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shap
 
 
 def _concavity(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
-    radius_mm = size.scale * rng.uniform(*USUAL_MAKING.bulge_ratio) * part.diagonal_mm
+    radius_mm = size.scale * rng.uniform(*DEFAULT_MAKING.bulge_ratio) * part.diagonal_mm
     depth_mm = min(rng.uniform(0.35, 0.7) * radius_mm, 0.6 * seed.thickness_mm)
-    if depth_mm < USUAL_MAKING.least_depth_ratio * part.diagonal_mm:
+    if depth_mm < DEFAULT_MAKING.least_depth_ratio * part.diagonal_mm:
         return None
     if size.smooth:
         return _swelling(part, seed, radius_mm, -depth_mm)
@@ -180,8 +180,8 @@ def _swelling(part: Part, seed: Seed, radius_mm: float, height_mm: float) -> Sha
     What faces away from the normal stays: the far side of a wall is none of the bump.
     """
     edge_mm = (
-        max(radius_mm, USUAL_MAKING.least_smooth_ratio * part.diagonal_mm)
-        / USUAL_MAKING.smooth_edges
+        max(radius_mm, DEFAULT_MAKING.least_smooth_ratio * part.diagonal_mm)
+        / DEFAULT_MAKING.smooth_edges
     )
     vertices, faces = mesh_of(part.solid.refine_to_length(edge_mm))
     corners = vertices[faces]
@@ -200,7 +200,7 @@ def _swelling(part: Part, seed: Seed, radius_mm: float, height_mm: float) -> Sha
 
 def _hole(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     radius_mm = size.scale * rng.uniform(0.02, 0.045) * part.diagonal_mm
-    if seed.thickness_mm < USUAL_MAKING.least_thickness_ratio * part.diagonal_mm:
+    if seed.thickness_mm < DEFAULT_MAKING.least_thickness_ratio * part.diagonal_mm:
         return None
     # The hole goes through thin walls and is blind in thick ones.
     depth_mm = min(1.1 * seed.thickness_mm, 0.12 * part.diagonal_mm)
@@ -217,7 +217,7 @@ def _hole(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
 def _crack(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape | None:
     diagonal_mm = part.diagonal_mm
     depth_mm = min(size.scale * rng.uniform(0.03, 0.06) * diagonal_mm, 0.7 * seed.thickness_mm)
-    if depth_mm < USUAL_MAKING.least_depth_ratio * diagonal_mm:
+    if depth_mm < DEFAULT_MAKING.least_depth_ratio * diagonal_mm:
         return None
     length_mm = size.scale * rng.uniform(0.12, 0.25) * diagonal_mm
     width_mm = size.scale * rng.uniform(0.012, 0.02) * diagonal_mm
@@ -268,7 +268,7 @@ def _break(part: Part, _seed: Seed, rng: np.random.Generator, size: Size) -> Sha
         return None
     # Splinters are dropped; whole bodies of a part in several pieces stay.
     kept = [
-        body for body in left.decompose() if body.volume() > USUAL_MAKING.splinter_ratio * volume
+        body for body in left.decompose() if body.volume() > DEFAULT_MAKING.splinter_ratio * volume
     ]
     return _result(part, m3.Manifold.compose(kept)) if kept else None
 
@@ -279,7 +279,7 @@ def _bend(part: Part, seed: Seed, rng: np.random.Generator, size: Size) -> Shape
     fine = part.solid.refine_to_length(diagonal_mm / 60)
     vertices, faces = mesh_of(fine)
     # Shares are of the surface and not of vertices, which crowd where the mesh is fine.
-    surface = sample_shape(part.shape, USUAL_MAKING.bend_points, rng).points_mm
+    surface = sample_shape(part.shape, DEFAULT_MAKING.bend_points, rng).points_mm
     middle = surface.mean(axis=0)
     axes = np.linalg.svd((surface - middle).T @ (surface - middle))[0]
     along = axes[:, 0] * (1 if rng.random() < 0.5 else -1)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.arrays import Faces, Mask, Points, Values, Vector, Vertices
-from amrepair.bench.options import USUAL_VIEWING
+from amrepair.bench.options import DEFAULT_VIEWING
 from amrepair.device import open3d
 from amrepair.errors import InputError
 from amrepair.frames import diagonal, rotation_of_quaternion, spread_directions
@@ -85,7 +85,7 @@ class Rays:
         for sensor in sensors_mm:
             to_sensor = sensor - start
             distance = np.linalg.norm(to_sensor, axis=1)
-            least_cosine = np.cos(np.deg2rad(USUAL_VIEWING.most_incidence_deg))
+            least_cosine = np.cos(np.deg2rad(DEFAULT_VIEWING.most_incidence_deg))
             facing = (to_sensor * surface.normals).sum(axis=1) > least_cosine * distance
             ask = np.flatnonzero(facing & ~found)
             if len(ask):
@@ -110,16 +110,16 @@ def sample_shape(shape: Shape, count: int, rng: np.random.Generator) -> SeenSurf
     )
 
 
-def sensors_around(shape: Shape, count: int = USUAL_VIEWING.sensors) -> Float[np.ndarray, "k 3"]:
+def sensors_around(shape: Shape, count: int = DEFAULT_VIEWING.sensors) -> Float[np.ndarray, "k 3"]:
     """(k, 3) sensors on a Fibonacci sphere about the part."""
     ways = spread_directions(count)
-    return _centre(shape) + USUAL_VIEWING.distance_ratio * shape.diagonal_mm * ways
+    return _centre(shape) + DEFAULT_VIEWING.distance_ratio * shape.diagonal_mm * ways
 
 
 def sensor_towards(shape: Shape, direction: Vector) -> Float[np.ndarray, "1 3"]:
     """(1, 3) one sensor in that direction from the part's centre."""
     unit = direction / np.linalg.norm(direction)
-    return (_centre(shape) + USUAL_VIEWING.distance_ratio * shape.diagonal_mm * unit)[None, :]
+    return (_centre(shape) + DEFAULT_VIEWING.distance_ratio * shape.diagonal_mm * unit)[None, :]
 
 
 def _centre(shape: Shape) -> Vector:
@@ -145,11 +145,11 @@ def look(
     """
     gradient = rng.normal(size=3)
     gradient *= (
-        rng.uniform(0, USUAL_VIEWING.density_log) / np.linalg.norm(gradient) / shape.diagonal_mm
+        rng.uniform(0, DEFAULT_VIEWING.density_log) / np.linalg.norm(gradient) / shape.diagonal_mm
     )
     seen: list[SeenSurface] = []
-    for _ in range(USUAL_VIEWING.rounds):
-        candidates = sample_shape(shape, USUAL_VIEWING.candidates * count, rng)
+    for _ in range(DEFAULT_VIEWING.rounds):
+        candidates = sample_shape(shape, DEFAULT_VIEWING.candidates * count, rng)
         seen.append(candidates.take(rays.seen(candidates, sensors_mm)))
         if sum(len(part.points_mm) for part in seen) >= 2 * count:
             break

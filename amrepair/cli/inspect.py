@@ -86,7 +86,7 @@ def align(
     with console.starting():
         import numpy as np
 
-        from amrepair.align.options import PAM_VARIANTS, USUAL_ALIGN
+        from amrepair.align.options import DEFAULT_ALIGN, PAM_VARIANTS
         from amrepair.repair import Stopwatch
         from amrepair.scans import write_ply
 
@@ -95,7 +95,7 @@ def align(
     with bars.shown():
         _, found, chosen = _laid(
             cloud, template, method, seed, watch, bars,
-            part_is_known=part_is_known, options=replace(USUAL_ALIGN, paper=settings),
+            part_is_known=part_is_known, options=replace(DEFAULT_ALIGN, paper=settings),
         )  # fmt: skip
         if output is not None:
             moved = cloud.moved(found.template_from_scan)
@@ -224,7 +224,7 @@ def detect(
         import numpy as np
 
         from amrepair.deficit import compute_deficit, measured_regions
-        from amrepair.deficit.options import USUAL_DEFICIT
+        from amrepair.deficit.options import DEFAULT_DEFICIT
         from amrepair.frames import Transform
         from amrepair.regions import detect as detect_defects
         from amrepair.repair import Stopwatch
@@ -243,7 +243,7 @@ def detect(
         _refuse_too_noisy(anomaly, smallest_mm, scan)
         with watch("measure"):
             in_place = Transform.identity("build", "template")
-            solids = replace(USUAL_DEFICIT, early_mm3=np.inf)  # nobody asks what stands there
+            solids = replace(DEFAULT_DEFICIT, early_mm3=np.inf)  # nobody asks what stands there
             deficit = compute_deficit(
                 placed, field, anomaly, build_from_template=in_place, options=solids, progress=bars
             )

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from amrepair.arrays import Values
 from amrepair.deficit.boxes import Sought
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
-from amrepair.deficit.options import USUAL_DEFICIT, DeficitOptions
+from amrepair.deficit.options import DEFAULT_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
@@ -105,7 +105,7 @@ class Deficit:
     unseen_area_mm2: float
     stands: Standing
     gone: PlannedBeads | None = None
-    options: DeficitOptions = USUAL_DEFICIT
+    options: DeficitOptions = DEFAULT_DEFICIT
 
     @property
     def as_built(self) -> HeightField:
@@ -132,7 +132,7 @@ def compute_deficit(
     printed_z_mm: float | None = None,
     as_built: AsBuilt | None = None,
     beads: PlannedBeads | None = None,
-    options: DeficitOptions = USUAL_DEFICIT,
+    options: DeficitOptions = DEFAULT_DEFICIT,
     progress: Progress = silent,
 ) -> Deficit:
     """Make solids of what is missing and of what is too much.

@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points
 from amrepair.deficit import heights_kernels as kernels
-from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
+from amrepair.deficit.options import DEFAULT_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
 from amrepair.frames import Transform, box_corners
@@ -43,7 +43,7 @@ def as_built_heights(
     build_from_template: Transform,
     printed_z_mm: float | None,
     images: tuple[RangeImage, ...] = (),
-    options: HeightOptions = USUAL_DEFICIT.heights,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
 ) -> HeightField:
     """Make the height field that a scan shows, build frame.
 
@@ -109,7 +109,7 @@ def standing_heights(
     expected: manifold3d.Manifold,
     missing: manifold3d.Manifold,
     excess: manifold3d.Manifold,
-    options: HeightOptions = USUAL_DEFICIT.heights,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
 ) -> tuple[HeightField, HeightMap, HeightMap]:
     """Sharpen the walls of a scan's height field with the solids, build frame.
 
@@ -299,7 +299,9 @@ def _by_chance(off_mm: HeightMap, around: int, options: HeightOptions) -> Column
 
 
 def without_missing(
-    seen: HeightField, missing: manifold3d.Manifold, options: HeightOptions = USUAL_DEFICIT.heights
+    seen: HeightField,
+    missing: manifold3d.Manifold,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
 ) -> HeightField:
     """Lower unseen columns to the bottom of what is missing there.
 

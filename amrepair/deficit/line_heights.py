@@ -21,7 +21,7 @@ from amrepair.deficit.heights import (
     with_what_stands_out,
     without_missing,
 )
-from amrepair.deficit.options import USUAL_DEFICIT, HeightOptions
+from amrepair.deficit.options import DEFAULT_DEFICIT, HeightOptions
 from amrepair.scans import Scan
 from gcode.slicing.job_lines import SAME_LEVEL_MM, JobLines
 from gcode.surfaces import HeightField
@@ -34,7 +34,7 @@ def standing_in_job(
     missing: manifold3d.Manifold,
     scan: Scan,
     spacing_mm: float,
-    options: HeightOptions = USUAL_DEFICIT.heights,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
 ) -> HeightField:
     """Make the height field in mid-job: as seen, less what is missing, with the lines' walls.
 
@@ -59,7 +59,7 @@ def standing_lines(
     seen: HeightField,
     lines: JobLines,
     missing: manifold3d.Manifold,
-    options: HeightOptions = USUAL_DEFICIT.heights,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
 ) -> HeightField:
     """The height field on a fine grid, where walls beside what is missing are those of the lines.
 

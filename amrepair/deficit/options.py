@@ -210,5 +210,5 @@ class DeficitOptions:
     walls: WallOptions = field(default_factory=WallOptions)
 
 
-USUAL_DEFICIT = DeficitOptions()
+DEFAULT_DEFICIT = DeficitOptions()
 """The default of the loop and the command line."""

@@ -12,7 +12,7 @@ from scipy import ndimage
 from skimage import measure
 
 from amrepair.arrays import Points, VoxelMask, Voxels
-from amrepair.deficit.options import USUAL_DEFICIT, VoxelOptions
+from amrepair.deficit.options import DEFAULT_DEFICIT, VoxelOptions
 from amrepair.errors import DeficitError
 from amrepair.field.groups import connected
 from amrepair.frames import grid_points
@@ -48,7 +48,7 @@ class VoxelBox:
         *,
         thickness_mm: float,
         across: int,
-        options: VoxelOptions = USUAL_DEFICIT.voxels,
+        options: VoxelOptions = DEFAULT_DEFICIT.voxels,
     ) -> VoxelBox:
         """A grid over a box, fine enough for a defect `thickness_mm` thick across one axis.
 

@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from amrepair.arrays import ColumnMask, HeightMap, Points, Values
 from amrepair.deficit import walls_kernels as kernels
-from amrepair.deficit.options import USUAL_DEFICIT, WallOptions
+from amrepair.deficit.options import DEFAULT_DEFICIT, WallOptions
 from amrepair.frames import cells_of, in_box
 from gcode.surfaces import HeightField
 
@@ -27,7 +27,7 @@ def with_sharp_walls(
     gone: ColumnMask,
     points_mm: Points,
     sigma_mm: float,
-    options: WallOptions = USUAL_DEFICIT.walls,
+    options: WallOptions = DEFAULT_DEFICIT.walls,
     *,
     deviation_mm: Values | None = None,
 ) -> HeightField:
@@ -78,7 +78,7 @@ def with_rims(
     lost_mm: HeightMap,
     designed_mm: HeightMap,
     spacing_mm: float,
-    options: WallOptions = USUAL_DEFICIT.walls,
+    options: WallOptions = DEFAULT_DEFICIT.walls,
 ) -> HeightField:
     """Raise crests, tops and lips beside what is missing to the height at which they stand.
 

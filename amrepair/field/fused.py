@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import fused_kernels as kernels
-from amrepair.field.options import USUAL_SURFELS, SurfelOptions
+from amrepair.field.options import DEFAULT_SURFELS, SurfelOptions
 from amrepair.field.places import PlaceTree
 from amrepair.frames import box_of, cells_of
 from amrepair.observe.views import Shares
@@ -134,7 +134,7 @@ class Surfels:
 
 
 def make_surfels(
-    scan: Scan, deviation_mm: Values, keep: Mask, options: SurfelOptions = USUAL_SURFELS
+    scan: Scan, deviation_mm: Values, keep: Mask, options: SurfelOptions = DEFAULT_SURFELS
 ) -> Surfels:
     """Condense the points in `keep` to cells, whose size follows from the point spacing."""
     points_mm, sensor_mm = scan.points_mm, None
@@ -170,7 +170,7 @@ def make_surfels(
 
 def estimate_spacing(points_mm: Points) -> float:
     """Estimate a surface cloud's mean point spacing from how many coarse cells it occupies."""
-    return _spacing(points_mm, np.ones(len(points_mm), bool), box_of(points_mm), USUAL_SURFELS)
+    return _spacing(points_mm, np.ones(len(points_mm), bool), box_of(points_mm), DEFAULT_SURFELS)
 
 
 def _spacing(

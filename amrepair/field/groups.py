@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from amrepair.arrays import Numbers, Points
 from amrepair.field import groups_kernels as kernels
-from amrepair.field.options import USUAL_SURFELS
+from amrepair.field.options import DEFAULT_SURFELS
 from amrepair.frames import cells_of
 from gcode.compiled import read_only
 
@@ -54,4 +54,4 @@ def area_per_point(surface_mm: Points) -> float:
     if len(surface_mm) == 0:
         return 0.0
     cells = int(cell_numbers(cells_of(surface_mm, 0.0, AREA_CELL_MM)).max()) + 1
-    return USUAL_SURFELS.area_per_cell * AREA_CELL_MM**2 * cells / len(surface_mm)
+    return DEFAULT_SURFELS.area_per_cell * AREA_CELL_MM**2 * cells / len(surface_mm)

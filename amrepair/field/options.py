@@ -148,5 +148,5 @@ class EvidenceOptions:
     occupancy: OccupancyOptions = field(default_factory=OccupancyOptions)
 
 
-USUAL_SURFELS = SurfelOptions()
+DEFAULT_SURFELS = SurfelOptions()
 """What scans are condensed by."""

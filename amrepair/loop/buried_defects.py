@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from amrepair.loop.looks import Look, Stop
-from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy import DEFAULT_POLICY, PolicyOptions
 from amrepair.policy.remedies import Way
 from amrepair.repair import RepairPlan
 from gcode.estimate import estimate
@@ -31,7 +31,10 @@ def pieces_of(plan: RepairPlan, here: Sequence[Look]) -> tuple[PatchRegion, ...]
 
 
 def buried(
-    pieces: Sequence[PatchRegion], stop: Stop, layer_mm: float, policy: PolicyOptions = USUAL_POLICY
+    pieces: Sequence[PatchRegion],
+    stop: Stop,
+    layer_mm: float,
+    policy: PolicyOptions = DEFAULT_POLICY,
 ) -> tuple[PatchRegion, ...]:
     """Pieces that begin a layer or more below the one just printed, and are not filled whole."""
     deep_mm = policy.one_layer * layer_mm

@@ -19,7 +19,7 @@ from amrepair.arrays import Box, PlanePoints, Values
 from amrepair.frames import nearest_box
 from amrepair.loop.layer_level import LayerLevel
 from amrepair.loop.objects import Objects
-from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy import DEFAULT_POLICY, PolicyOptions
 from amrepair.policy.acceptance import Piece, defect_volumes
 from amrepair.policy.table import Action, Cover, Finding, judge
 from amrepair.regions import Label, Region
@@ -201,7 +201,7 @@ def _owners(
     return found
 
 
-def _whole_defects(regions: Sequence[Region], policy: PolicyOptions = USUAL_POLICY) -> Values:
+def _whole_defects(regions: Sequence[Region], policy: PolicyOptions = DEFAULT_POLICY) -> Values:
     """(n,) volume of the defect that each region is a piece of, mm³."""
     whole_mm3 = np.zeros(len(regions))
     for label in Label:
@@ -215,7 +215,7 @@ def early_action(
     job: Job,
     setup: PrintSetup,
     layer_index: int | None,
-    policy: PolicyOptions = USUAL_POLICY,
+    policy: PolicyOptions = DEFAULT_POLICY,
 ) -> Action:
     """What the table says of a missing region before anybody knows what can be reached of it."""
     return judge(_alone(region, job, layer_index, setup.process.layer_height_mm), policy).action

@@ -107,5 +107,5 @@ class KindOptions:
     wall_cosine: float = 0.4
 
 
-USUAL_KINDS = KindOptions()
+DEFAULT_KINDS = KindOptions()
 """What the loop goes by."""

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from amrepair.arrays import Box, Mask, Matrix, PlanePoints, Values, Vector
 from amrepair.frames import Transform, turned_rad
 from amrepair.loop.findings import matching
-from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
+from amrepair.loop.kind_options import DEFAULT_KINDS, KindOptions
 from amrepair.loop.shapes import bead_way, last_beads, over_last_beads, spread, tall_mm
 from amrepair.loop.shapes import chain as chain_of
 from amrepair.regions import Label, Region
@@ -72,7 +72,7 @@ def typed(
     *,
     repaired: bool = False,
     mended: manifold3d.Manifold | None = None,
-    options: KindOptions = USUAL_KINDS,
+    options: KindOptions = DEFAULT_KINDS,
 ) -> RepairPlan:
     """The plan with every region typed.
 

@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 
 from amrepair.arrays import Box, Points, Values
 from amrepair.observe.robust import MAD_TO_SIGMA
-from amrepair.policy import USUAL_POLICY
+from amrepair.policy import DEFAULT_POLICY
 from amrepair.repair import RepairPlan
 
 
@@ -42,7 +42,7 @@ class FlowOptions:
 
     false_alarm: float = 1e-3
     patch_mm: float = 2.0
-    tolerance_layers: float = USUAL_POLICY.least_layers
+    tolerance_layers: float = DEFAULT_POLICY.least_layers
     band_layers: float = 2.0
     least_points: int = 5
     least_patches: int = 6

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from amrepair.loop.kind_options import USUAL_KINDS, KindOptions
+from amrepair.loop.kind_options import DEFAULT_KINDS, KindOptions
 from amrepair.loop.looks import Look
 from amrepair.loop.pace import Pace
 from amrepair.loop.tape import Tape
 from amrepair.loop.wire import PickUp
-from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions
+from amrepair.policy import DEFAULT_POLICY, Decision, PolicyOptions
 from amrepair.regions.error_calibration import Calibration
 from amrepair.repair import RepairPlan, Stopwatch
 from amrepair.scans import Scan
@@ -42,8 +42,8 @@ class LoopOptions:
         Of the searches for a pose.
     """
 
-    policy: PolicyOptions = USUAL_POLICY
-    kinds: KindOptions = USUAL_KINDS
+    policy: PolicyOptions = DEFAULT_POLICY
+    kinds: KindOptions = DEFAULT_KINDS
     pace: Pace | None = None
     limits: ProcessProfile | None = None
     silent_stops: int = 0

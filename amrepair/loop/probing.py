@@ -22,7 +22,7 @@ from amrepair.loop.looks import Stop, plan_stops
 from amrepair.loop.sequential_objects import finished_at
 from amrepair.loop.tape import FELT
 from amrepair.loop.touch_design import (
-    USUAL_TOUCHES,
+    DEFAULT_TOUCHES,
     Flats,
     ProbeOptions,
     first_places,
@@ -162,7 +162,7 @@ class ProbeScanner:
         job: Job,
         setup: PrintSetup,
         *,
-        options: ProbeOptions = USUAL_TOUCHES,
+        options: ProbeOptions = DEFAULT_TOUCHES,
         clock: Callable[[], float] = time.monotonic,
         progress: Progress = silent,
     ) -> None:

@@ -21,7 +21,7 @@ from amrepair.loop.looks import Stop, plan_stops
 from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.options import LoopOptions
 from amrepair.loop.pace import Pace
-from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy import DEFAULT_POLICY, PolicyOptions
 from amrepair.regions.error_calibration import Calibration, as_tuples
 from amrepair.scans import PROBE
 from amrepair.template import MeshSdf, StoodTemplate, load_template
@@ -79,7 +79,7 @@ class Setting:
     build_from_template: tuple[tuple[float, ...], ...]
     build_from_scanner: tuple[tuple[float, ...], ...]
     seed: int
-    policy: PolicyOptions = USUAL_POLICY
+    policy: PolicyOptions = DEFAULT_POLICY
     limited: bool = False
     adaptive: int = 0
     port: str = ""

@@ -30,7 +30,7 @@ from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.repair import Detector, Site
-from amrepair.repair.options import USUAL_REPAIR
+from amrepair.repair.options import DEFAULT_REPAIR
 from amrepair.repair.site import Finished, Raft
 from amrepair.template import CutTemplate, KeptFills, LaidBeads, PlannedSdf
 from amrepair.template.port import Template
@@ -279,7 +279,7 @@ def _left_open(job: Job, template: Template, build_from_template: Transform) -> 
     part = HeightField.from_manifold(
         build_from_template.solid(template.solid()),
         BESIDE_CELL_MM,
-        margin_mm=USUAL_REPAIR.stray_mm,
+        margin_mm=DEFAULT_REPAIR.stray_mm,
     )
     pick = (beads.layer >= 0) & ~of_roles(beads, BESIDE_THE_PART)
     half_mm = half_widths_mm(beads, pick)
@@ -307,7 +307,7 @@ def _beside(job: Job, which: Mask) -> HeightField | None:
     pick = which & of_roles(beads, BESIDE_THE_PART)
     if not pick.any():
         return None
-    within_mm = half_widths_mm(beads, pick) + USUAL_REPAIR.stray_mm
+    within_mm = half_widths_mm(beads, pick) + DEFAULT_REPAIR.stray_mm
     low, shape = columns_around(
         beads.start_mm[pick], beads.end_mm[pick], float(within_mm.max()), BESIDE_CELL_MM
     )

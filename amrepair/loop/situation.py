@@ -10,7 +10,7 @@ from amrepair.loop.filaments import other_material
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
 from amrepair.loop.objects import Objects
-from amrepair.policy import USUAL_POLICY, Decision, PolicyOptions, decide, gravest, judge
+from amrepair.policy import DEFAULT_POLICY, Decision, PolicyOptions, decide, gravest, judge
 from amrepair.policy.acceptance import volume_mm3
 from amrepair.policy.limits import exceeded
 from amrepair.policy.stopping_criteria import is_little, is_stuck
@@ -29,7 +29,7 @@ def decide_look(
     *,
     seen_twice: bool,
     limits: ProcessProfile | None,
-    policy: PolicyOptions = USUAL_POLICY,
+    policy: PolicyOptions = DEFAULT_POLICY,
     objects: Objects | None = None,
 ) -> Decision:
     """What the table says of a plan.

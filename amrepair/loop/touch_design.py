@@ -86,7 +86,7 @@ class ProbeOptions:
     sure_sigmas: float = 4.0
 
 
-USUAL_TOUCHES = ProbeOptions()
+DEFAULT_TOUCHES = ProbeOptions()
 """What a probe is told where nobody says otherwise."""
 
 
@@ -112,7 +112,7 @@ class Flats:
     top_mm: HeightMap
     worth_mm: HeightMap
     may: ColumnMask
-    options: ProbeOptions = USUAL_TOUCHES
+    options: ProbeOptions = DEFAULT_TOUCHES
 
     def xy_mm(self, rows: np.ndarray, columns: np.ndarray) -> Float[np.ndarray, "k 2"]:
         """(k, 2) middles of cells."""
@@ -130,7 +130,7 @@ def flats_of(
     stop: Stop,
     setup: PrintSetup,
     standing: HeightField,
-    options: ProbeOptions = USUAL_TOUCHES,
+    options: ProbeOptions = DEFAULT_TOUCHES,
 ) -> Flats:
     """The last layer of a stop, or all tops of the finished part.
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Mask, Points, Values
-from amrepair.loop.touch_design import USUAL_TOUCHES, Flats, ProbeOptions
+from amrepair.loop.touch_design import DEFAULT_TOUCHES, Flats, ProbeOptions
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import PROBE, Scan
 
@@ -42,7 +42,7 @@ class Touches:
     place_mm: Points
     planned_mm: Values
     sigma_mm: float
-    options: ProbeOptions = USUAL_TOUCHES
+    options: ProbeOptions = DEFAULT_TOUCHES
 
     @property
     def off_mm(self) -> Values:
@@ -59,7 +59,7 @@ class Touches:
 
 
 def measured_sigma_mm(
-    repeated_mm: Float[np.ndarray, " r"], told_mm: float, options: ProbeOptions = USUAL_TOUCHES
+    repeated_mm: Float[np.ndarray, " r"], told_mm: float, options: ProbeOptions = DEFAULT_TOUCHES
 ) -> float:
     """Standard deviation of one touch, from touches of one place and what the profile says.
 

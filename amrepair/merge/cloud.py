@@ -16,7 +16,7 @@ from amrepair.arrays import Mask, Numbers, Points, Values, Vector
 from amrepair.field.near import spacing_in
 from amrepair.frames import cells_of, spread_directions
 from amrepair.merge import fuse_kernels as kernels
-from amrepair.merge.options import USUAL_CLOUD
+from amrepair.merge.options import DEFAULT_CLOUD
 from gcode.compiled import read_only
 
 
@@ -100,18 +100,21 @@ def planes(points_mm: Points, spacing_mm: float) -> Planes:
     other sides only add to it, so the noise is a low quantile, by the narrowest planes.
     """
     narrow_mm, wide_mm = (
-        np.sqrt(np.array([USUAL_CLOUD.narrow_points, USUAL_CLOUD.wide_points]) / np.pi) * spacing_mm
+        np.sqrt(np.array([DEFAULT_CLOUD.narrow_points, DEFAULT_CLOUD.wide_points]) / np.pi)
+        * spacing_mm
     )
     found = _planes(points_mm, narrow_mm, None)
     reached_mm, radius_mm = narrow_mm, wide_mm
-    for _ in range(USUAL_CLOUD.growths):
+    for _ in range(DEFAULT_CLOUD.growths):
         # a ball not much wider than the noise cuts it off at its ends
-        told = found.sigma_mm if reached_mm >= USUAL_CLOUD.noise_noises * found.sigma_mm else None
+        told = found.sigma_mm if reached_mm >= DEFAULT_CLOUD.noise_noises * found.sigma_mm else None
         found = _planes(points_mm, radius_mm, told).or_better(found)
-        if radius_mm >= USUAL_CLOUD.plane_noises * found.sigma_mm:
+        if radius_mm >= DEFAULT_CLOUD.plane_noises * found.sigma_mm:
             break
         reached_mm = radius_mm
-        radius_mm = min(USUAL_CLOUD.growth * radius_mm, USUAL_CLOUD.plane_noises * found.sigma_mm)
+        radius_mm = min(
+            DEFAULT_CLOUD.growth * radius_mm, DEFAULT_CLOUD.plane_noises * found.sigma_mm
+        )
     return found
 
 
@@ -123,11 +126,13 @@ def _planes(points_mm: Points, radius_mm: float, sigma_mm: float | None) -> Plan
     normals[cells.order], variance[cells.order], m[cells.order] = found, least, count
     variance = np.maximum(variance, 0.0)
     if sigma_mm is None:
-        enough = m >= USUAL_CLOUD.least_plane_points
+        enough = m >= DEFAULT_CLOUD.least_plane_points
         freedom = m[enough] - 3
-        ratio = variance[enough] * m[enough] / chdtri(freedom, 1.0 - USUAL_CLOUD.noise_quantile)
+        ratio = variance[enough] * m[enough] / chdtri(freedom, 1.0 - DEFAULT_CLOUD.noise_quantile)
         sigma_mm = (
-            float(np.sqrt(np.quantile(ratio, USUAL_CLOUD.noise_quantile))) if enough.any() else 0.0
+            float(np.sqrt(np.quantile(ratio, DEFAULT_CLOUD.noise_quantile)))
+            if enough.any()
+            else 0.0
         )
     # residuals over the points' lever: over a disc, each coordinate has a quarter of r² as variance
     freedom = np.maximum(m - 3, 0.5)
@@ -154,7 +159,7 @@ def outward(
         Which of them may turn; all where none are given.
     """
     whose = np.arange(len(points_mm)) if asked is None else asked
-    step = len(whose) // USUAL_CLOUD.looking_points + 1
+    step = len(whose) // DEFAULT_CLOUD.looking_points + 1
     look, facing = (np.ascontiguousarray(each[whose[::step]]) for each in (points_mm, normals))
     votes = _seen_from(look, facing, points_mm, normals, spacing_mm, sigma_mm)
     side = _agreed(look, facing, (facing * votes).sum(axis=1), spacing_mm * np.sqrt(step), sigma_mm)
@@ -177,11 +182,11 @@ def outward_by(
     asked = np.flatnonzero(~known)
     told, by = _told_by(
         points_mm[asked], normals[asked], points_mm[known], normals[known], spacing_mm, sigma_mm,
-        within_mm=USUAL_CLOUD.tells_spacings * spacing_mm,
+        within_mm=DEFAULT_CLOUD.tells_spacings * spacing_mm,
     )  # fmt: skip
     found = normals.copy()
     found[asked] *= np.where(told < 0, -1.0, 1.0)[:, None]
-    rest = asked[by < USUAL_CLOUD.told_enough]
+    rest = asked[by < DEFAULT_CLOUD.told_enough]
     return outward(points_mm, found, spacing_mm, sigma_mm, rest) if len(rest) else found
 
 
@@ -198,7 +203,7 @@ def _told_by(
 
     Those on its own sheet: at its height, by the mean of both planes.
     """
-    near = min(USUAL_CLOUD.told_by, len(look_mm))
+    near = min(DEFAULT_CLOUD.told_by, len(look_mm))
     if near == 0:
         return np.zeros(len(points_mm)), np.zeros(len(points_mm))
     away, index = cKDTree(look_mm).query(
@@ -210,7 +215,9 @@ def _told_by(
     offset = look_mm[index] - points_mm[:, None]
     mean = normals[:, None] + np.sign(cosine)[..., None] * facing[index]
     height = np.einsum("nka,nka->nk", offset, mean) / 2
-    slack = np.maximum(USUAL_CLOUD.sheet_slope * away, USUAL_CLOUD.sheet_noises * sigma_mm) + 1e-9
+    slack = (
+        np.maximum(DEFAULT_CLOUD.sheet_slope * away, DEFAULT_CLOUD.sheet_noises * sigma_mm) + 1e-9
+    )
     beside = np.where(there, np.exp(-((height / slack) ** 2)) * np.abs(cosine), 0.0)
     said = beside * np.sign(cosine) / (away + 0.1 * spacing_mm) ** 2
     return said.sum(axis=1), beside.sum(axis=1)
@@ -225,21 +232,21 @@ def _seen_from(
     sigma_mm: float,
 ) -> Float[np.ndarray, "s 3"]:
     """(s, 3) sums of the directions in which places see far past the points' discs."""
-    step = len(points_mm) // USUAL_CLOUD.hiding_points + 1
+    step = len(points_mm) // DEFAULT_CLOUD.hiding_points + 1
     place, plane = (read_only(each[::step]) for each in (points_mm, normals))
-    disc_mm = USUAL_CLOUD.disc_spacings * spacing_mm * float(np.sqrt(step))
+    disc_mm = DEFAULT_CLOUD.disc_spacings * spacing_mm * float(np.sqrt(step))
     extent_mm = float(np.ptp(place, axis=0).max())
-    cell_mm = max(disc_mm, extent_mm / USUAL_CLOUD.most_cells)
+    cell_mm = max(disc_mm, extent_mm / DEFAULT_CLOUD.most_cells)
     low = place.min(axis=0) - 2.0 * cell_mm - disc_mm
     shape = np.floor((place.max(axis=0) + disc_mm - low) / cell_mm).astype(np.int64) + 3
     start, discs = kernels.discs_of_cells(place, plane, disc_mm, low, cell_mm, shape)
-    noise_mm = USUAL_CLOUD.sheet_noises * sigma_mm
-    own_mm = max(USUAL_CLOUD.own_discs * disc_mm, 2.0 * noise_mm)
+    noise_mm = DEFAULT_CLOUD.sheet_noises * sigma_mm
+    own_mm = max(DEFAULT_CLOUD.own_discs * disc_mm, 2.0 * noise_mm)
     ways, grid = (
-        spread_directions(USUAL_CLOUD.directions),
+        spread_directions(DEFAULT_CLOUD.directions),
         kernels.PointGrid(low, cell_mm, shape, start),
     )
-    sheet = kernels.Sheet(disc_mm, own_mm, USUAL_CLOUD.sheet_slope, noise_mm)
+    sheet = kernels.Sheet(disc_mm, own_mm, DEFAULT_CLOUD.sheet_slope, noise_mm)
     return np.asarray(kernels.open_side(look_mm, facing, ways, place, plane, grid, discs, sheet))
 
 
@@ -254,7 +261,7 @@ def _agreed(
     from scipy.sparse import coo_matrix
 
     pairs = cKDTree(look_mm).query_pairs(
-        USUAL_CLOUD.tells_spacings * spacing_mm, output_type="ndarray"
+        DEFAULT_CLOUD.tells_spacings * spacing_mm, output_type="ndarray"
     )
     i, j = pairs[:, 0], pairs[:, 1]
     cosine = (plane[i] * plane[j]).sum(axis=1)
@@ -263,7 +270,7 @@ def _agreed(
     height = np.abs((offset * (plane[i] + np.sign(cosine)[:, None] * plane[j])).sum(axis=1)) / 2
     together = np.abs(cosine) > 0.8
     together &= height < np.maximum(
-        USUAL_CLOUD.sheet_slope * reach, USUAL_CLOUD.sheet_noises * sigma_mm
+        DEFAULT_CLOUD.sheet_slope * reach, DEFAULT_CLOUD.sheet_noises * sigma_mm
     )
     weight = np.where(together, cosine, 0.0)
     count = len(look_mm)
@@ -271,6 +278,6 @@ def _agreed(
     graph = graph + graph.T
     degree = np.maximum(np.asarray(np.abs(graph).sum(axis=1)).ravel(), 1.0)
     found = side
-    for _ in range(USUAL_CLOUD.agree_rounds):
+    for _ in range(DEFAULT_CLOUD.agree_rounds):
         found = 0.05 * side + 0.95 * (graph @ found) / degree
     return np.where(found == 0, side, found)

@@ -17,7 +17,7 @@ from amrepair.frames import diagonal
 from amrepair.merge.cloud import outward_by, planes, spacing_of
 from amrepair.merge.fuse import Cloud, Fused, fuse, widened
 from amrepair.merge.joint import Slack
-from amrepair.merge.options import USUAL_MERGE, MergeOptions
+from amrepair.merge.options import DEFAULT_MERGE, MergeOptions
 from amrepair.merge.place import Placement, place
 from amrepair.merge.views import View
 from amrepair.scans import Scan
@@ -86,7 +86,7 @@ def fit_from_scans(
     *,
     poses: Mapping[str, Matrix] | None = None,
     turntable_deg: float | None = None,
-    options: MergeOptions = USUAL_MERGE,
+    options: MergeOptions = DEFAULT_MERGE,
     seed: int = 0,
     progress: Progress = silent,
 ) -> ScanFit:

@@ -20,7 +20,7 @@ from amrepair.errors import TemplateError
 from amrepair.frames import cells_of
 from amrepair.merge import fuse_kernels as kernels
 from amrepair.merge.cloud import SortedPoints
-from amrepair.merge.options import USUAL_FUSE, FuseOptions
+from amrepair.merge.options import DEFAULT_FUSE, FuseOptions
 from amrepair.template.extract import zero_level
 from amrepair.template.grid import Coverage, surface_elements
 from amrepair.template.learned import Tolerance
@@ -97,7 +97,7 @@ class Fused:
     coverage: Coverage
 
 
-def fuse(cloud: Cloud, options: FuseOptions = USUAL_FUSE) -> Fused:
+def fuse(cloud: Cloud, options: FuseOptions = DEFAULT_FUSE) -> Fused:
     """Fuse placed scans.
 
     Raises
@@ -334,7 +334,7 @@ def _ask(grid: Voxels, asked: VoxelMask, closing: MeshSdf, low: Vector, edge: fl
     grid[asked] = found
 
 
-def _poisson(points_mm: Points, normals: Points, options: FuseOptions = USUAL_FUSE) -> MeshSdf:
+def _poisson(points_mm: Points, normals: Points, options: FuseOptions = DEFAULT_FUSE) -> MeshSdf:
     """A closed surface through oriented points."""
     import trimesh
 
@@ -353,7 +353,7 @@ def _poisson(points_mm: Points, normals: Points, options: FuseOptions = USUAL_FU
 
 
 def solid_surface(
-    grid: Voxels, low: Vector, edge: float, dust_ratio: float = USUAL_FUSE.dust_ratio
+    grid: Voxels, low: Vector, edge: float, dust_ratio: float = DEFAULT_FUSE.dust_ratio
 ) -> trimesh.Trimesh:
     """Marching cubes, without dust; a valid solid."""
     import manifold3d as m3

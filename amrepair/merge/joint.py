@@ -28,7 +28,7 @@ from amrepair.align.registration import bounded_inverse
 from amrepair.arrays import Mask, Matrix, Points, Values, Vector
 from amrepair.frames import cells_of, diagonal, motion_about, moved
 from amrepair.merge.kept import KeptAnswers
-from amrepair.merge.options import USUAL_MERGE, JointOptions
+from amrepair.merge.options import DEFAULT_MERGE, JointOptions
 from amrepair.merge.threads import in_threads
 from amrepair.merge.views import View, loss_weight
 
@@ -98,7 +98,7 @@ def together(
     views: Sequence[View],
     poses: Sequence[Matrix],
     rng: np.random.Generator,
-    options: JointOptions = USUAL_MERGE.joint,
+    options: JointOptions = DEFAULT_MERGE.joint,
 ) -> tuple[list[Matrix], float]:
     """All poses but the first, refined jointly; and the residual's root mean square, mm."""
     found = [np.array(pose) for pose in poses]
@@ -136,7 +136,7 @@ def slacks(
     views: Sequence[View],
     poses: Sequence[Matrix],
     rng: np.random.Generator,
-    options: JointOptions = USUAL_MERGE.joint,
+    options: JointOptions = DEFAULT_MERGE.joint,
 ) -> list[Slack]:
     """How surely each refined pose is held, against the scan against which most are held best."""
     count = len(views)

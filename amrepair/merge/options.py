@@ -141,7 +141,7 @@ class FuseOptions:
     poisson_points: int = 150_000
 
 
-USUAL_FUSE = FuseOptions()
+DEFAULT_FUSE = FuseOptions()
 """What scans are fused by."""
 
 
@@ -352,7 +352,7 @@ class MergeOptions:
         return self.most_against_guessed if guessed else self.most_against
 
 
-USUAL_MERGE = MergeOptions()
+DEFAULT_MERGE = MergeOptions()
 """What the command line goes by."""
 
 
@@ -415,4 +415,4 @@ class CloudOptions:
     agree_rounds: int = 60
 
 
-USUAL_CLOUD = CloudOptions()
+DEFAULT_CLOUD = CloudOptions()

@@ -12,7 +12,7 @@ from amrepair.errors import AlignmentError
 from amrepair.frames import moved
 from amrepair.merge.groups import Graph, grouped
 from amrepair.merge.joint import Slack, slacks, together
-from amrepair.merge.options import USUAL_MERGE, MergeOptions
+from amrepair.merge.options import DEFAULT_MERGE, MergeOptions
 from amrepair.merge.told import of_views, on_turntable
 from amrepair.merge.views import Fit, Placed, View, joined, judged
 from gcode.progress import Progress, silent
@@ -47,7 +47,7 @@ def place(
     told: Mapping[str, Matrix] | None = None,
     unit_mm: float = 1.0,
     turntable_deg: float | None = None,
-    options: MergeOptions = USUAL_MERGE,
+    options: MergeOptions = DEFAULT_MERGE,
     progress: Progress = silent,
 ) -> Placement:
     """Bring views of one part into one frame.

@@ -17,7 +17,7 @@ from amrepair.arrays import Matrix, Numbers, Points, Vector
 from amrepair.frames import diagonal, moved, spread_directions, ways_across
 from amrepair.merge import sight_kernels as kernels
 from amrepair.merge.cloud import outward, planes, spacing_of
-from amrepair.merge.options import USUAL_MERGE, SightOptions
+from amrepair.merge.options import DEFAULT_MERGE, SightOptions
 from gcode.compiled import read_only
 
 
@@ -64,7 +64,7 @@ class DepthImage:
         *,
         way: Vector | None = None,
         guessed: bool = False,
-        options: SightOptions = USUAL_MERGE.sight,
+        options: SightOptions = DEFAULT_MERGE.sight,
     ) -> DepthImage:
         """The image of what a sensor saw, that stood still or moved along a way (unit vector)."""
         closing, edge_on = options.closing_px, options.edge_on
@@ -202,7 +202,7 @@ def told(
     points_mm: Points,
     sensors_mm: Float[np.ndarray, "k 3"],
     sensor_index: Numbers,
-    options: SightOptions = USUAL_MERGE.sight,
+    options: SightOptions = DEFAULT_MERGE.sight,
 ) -> DepthImages:
     """Looks of sensors whose places are known; many places on a line are one that moved along."""
     if len(sensors_mm) > 3:
@@ -222,7 +222,7 @@ def told(
 
 
 def guess_directions(
-    points_mm: Points, options: SightOptions = USUAL_MERGE.sight
+    points_mm: Points, options: SightOptions = DEFAULT_MERGE.sight
 ) -> Float[np.ndarray, "k 3"]:
     """Ways to where one sensor may have stood that saw all of these points; none of a whole scan.
 
@@ -247,7 +247,9 @@ def guess_directions(
 
 
 def guessed(
-    points_mm: Points, towards: Float[np.ndarray, "k 3"], options: SightOptions = USUAL_MERGE.sight
+    points_mm: Points,
+    towards: Float[np.ndarray, "k 3"],
+    options: SightOptions = DEFAULT_MERGE.sight,
 ) -> DepthImages:
     """Looks from every place where the sensor may have stood."""
     centre = points_mm.mean(axis=0)

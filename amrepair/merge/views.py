@@ -18,7 +18,7 @@ from amrepair.errors import InputError
 from amrepair.frames import diagonal, motion_about, moved
 from amrepair.merge import sight
 from amrepair.merge.cloud import outward, planes, spacing_of
-from amrepair.merge.options import USUAL_MERGE, JudgeOptions, MergeOptions
+from amrepair.merge.options import DEFAULT_MERGE, JudgeOptions, MergeOptions
 from amrepair.merge.threads import in_threads
 from amrepair.scans import Scan
 
@@ -82,7 +82,9 @@ class View:
     clear: float
 
     @classmethod
-    def of(cls, scan: Scan, rng: np.random.Generator, options: MergeOptions = USUAL_MERGE) -> View:
+    def of(
+        cls, scan: Scan, rng: np.random.Generator, options: MergeOptions = DEFAULT_MERGE
+    ) -> View:
         """Measure a scan.
 
         Raises

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Mask, Points, Values
 from amrepair.frames import cells_of
-from amrepair.observe.options import USUAL_BACKGROUND, BackgroundOptions
+from amrepair.observe.options import DEFAULT_BACKGROUND, BackgroundOptions
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
@@ -20,7 +20,7 @@ def background(
     template: Template,
     f_mm: Values,
     surface_mm: Float[np.ndarray, "m 3"],
-    options: BackgroundOptions = USUAL_BACKGROUND,
+    options: BackgroundOptions = DEFAULT_BACKGROUND,
 ) -> Mask:
     """Bed, skirt and far clutter: outside the part, near its lowest plane or far away."""
     low_z = float(template.bounds_mm[0, 2])

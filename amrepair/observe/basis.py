@@ -51,7 +51,7 @@ class NuisanceOptions:
     support_p: float = 0.01
 
 
-USUAL_NUISANCE = NuisanceOptions()
+DEFAULT_NUISANCE = NuisanceOptions()
 """What every fit goes by."""
 
 
@@ -128,7 +128,7 @@ def priors(
     what they have in common and what they differ by, each with its own prior. Where the pose is
     known nothing is taken for it, nor for an offset of all views: what lies off as a whole is off.
     """
-    options = USUAL_NUISANCE
+    options = DEFAULT_NUISANCE
     pose = [options.pose_translation_sigma_mm] * 3 + [options.pose_rotation_sigma_rad] * 3
     common_mm = options.common_offset_sigma_mm
     if pose_known:

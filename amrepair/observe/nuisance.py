@@ -17,8 +17,8 @@ from amrepair.arrays import Numbers, Points, Values
 from amrepair.errors import InputError
 from amrepair.observe.basis import (
     BOW_AT,
+    DEFAULT_NUISANCE,
     SCALE_AT,
-    USUAL_NUISANCE,
     VIEWS_AT,
     Frame,
     bow_moves,
@@ -118,22 +118,22 @@ class Nuisance:
 
     def _told_pose(self) -> list[str]:
         moved_mm, turned = np.linalg.norm(self.twist[:3]), np.linalg.norm(self.twist[3:])
-        far = moved_mm > USUAL_NUISANCE.told_sigma * USUAL_NUISANCE.pose_translation_sigma_mm
-        if far or turned > USUAL_NUISANCE.told_sigma * USUAL_NUISANCE.pose_rotation_sigma_rad:
+        far = moved_mm > DEFAULT_NUISANCE.told_sigma * DEFAULT_NUISANCE.pose_translation_sigma_mm
+        if far or turned > DEFAULT_NUISANCE.told_sigma * DEFAULT_NUISANCE.pose_rotation_sigma_rad:
             degrees = np.degrees(turned)
             return [f"It lies {moved_mm:.2f} mm and {degrees:.2f}° from where it was laid."]
         return []
 
     def _told_scale(self) -> list[str]:
-        prior = USUAL_NUISANCE.scale_sigma_ratio
-        if abs(self.scale_ratio) <= USUAL_NUISANCE.told_sigma * prior:
+        prior = DEFAULT_NUISANCE.scale_sigma_ratio
+        if abs(self.scale_ratio) <= DEFAULT_NUISANCE.told_sigma * prior:
             return []
         word = "small" if self.scale_ratio < 0 else "large"
         percent = 100 * abs(self.scale_ratio)
         return [f"The part is {percent:.1f} % {word} (prior {100 * prior:.1f} %)."]
 
     def _told_bow(self) -> list[str]:
-        prior_mm = USUAL_NUISANCE.bow_sigma_mm
+        prior_mm = DEFAULT_NUISANCE.bow_sigma_mm
         length = [f"{2 * half_mm:.0f}" for half_mm in self.frame.half_extent_mm]
         sags = np.abs(self.bow_mm[1:3])
         flatness_mm = self.flatness_mm
@@ -141,7 +141,7 @@ class Nuisance:
         over = length[int(np.argmax(sags))] if alone else f"{length[0]} × {length[1]}"
         told = []
         for bow_mm, where in ((flatness_mm, over), (abs(self.bow_mm[0]), length[0])):
-            if bow_mm > USUAL_NUISANCE.told_sigma * prior_mm:
+            if bow_mm > DEFAULT_NUISANCE.told_sigma * prior_mm:
                 told.append(f"It is bent by {bow_mm:.2f} mm over {where} mm (prior {prior_mm} mm).")
         return told
 
@@ -153,7 +153,7 @@ class Nuisance:
         return float(np.ptp(along_mm))
 
     def _told_views(self) -> list[str]:
-        offset, options = self.view_offset_mm, USUAL_NUISANCE
+        offset, options = self.view_offset_mm, DEFAULT_NUISANCE
         told: list[str] = []
 
         def tell(lies: str, off_mm: float, prior_mm: float, beside: str) -> None:
@@ -293,7 +293,7 @@ def _supported(
             if name != "pose" and kept[at].all()
         }
         weakest = max(chance, key=chance.__getitem__, default="")
-        if not weakest or chance[weakest] < USUAL_NUISANCE.support_p:
+        if not weakest or chance[weakest] < DEFAULT_NUISANCE.support_p:
             return solution, kept, spread
         stay = np.delete(np.arange(int(kept.sum())), place[terms[weakest]])
         starts = (solution.unknown[stay],)

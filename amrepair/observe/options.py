@@ -44,5 +44,5 @@ class BackgroundOptions:
     most_foot: int = 20_000
 
 
-USUAL_BACKGROUND = BackgroundOptions()
+DEFAULT_BACKGROUND = BackgroundOptions()
 """The default of the test for regions."""

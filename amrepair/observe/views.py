@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amrepair.arrays import Mask, Numbers, Values
-from amrepair.observe.basis import USUAL_NUISANCE
+from amrepair.observe.basis import DEFAULT_NUISANCE
 from amrepair.observe.robust import MAD_TO_SIGMA
 
 LEAST_PLACES = 30  # a view that shares fewer places with others cannot be compared
@@ -98,7 +98,7 @@ def contradictions(shares: Shares, *, point_sigma_mm: float) -> tuple[Contradict
         Standard deviation of one point about its neighbours.
     """
     found: list[Contradiction] = []
-    options = USUAL_NUISANCE
+    options = DEFAULT_NUISANCE
     told = shares.gathered()
     while True:
         points, place = told.count, told.place

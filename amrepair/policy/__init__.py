@@ -7,7 +7,7 @@ repair, `stopping_criteria` when to stop repairing, `limits` what may be printed
 `remedies` what can be done about a defect that was found too late.
 """
 
-from amrepair.policy.options import USUAL_POLICY, PolicyOptions
+from amrepair.policy.options import DEFAULT_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Decision, decide, gravest, judge
 
-__all__ = ["USUAL_POLICY", "Action", "Decision", "PolicyOptions", "decide", "gravest", "judge"]
+__all__ = ["DEFAULT_POLICY", "Action", "Decision", "PolicyOptions", "decide", "gravest", "judge"]

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from amrepair.arrays import Box, Mask, Values
-from amrepair.policy.options import USUAL_POLICY, PolicyOptions
+from amrepair.policy.options import DEFAULT_POLICY, PolicyOptions
 from amrepair.regions import Label, Region
 
 
@@ -34,7 +34,7 @@ class Piece(NamedTuple):
         return cls(np.asarray(region.box_mm), region.volume_mm3, region.skipped)
 
 
-def defect_volumes(pieces: Sequence[Piece], options: PolicyOptions = USUAL_POLICY) -> Values:
+def defect_volumes(pieces: Sequence[Piece], options: PolicyOptions = DEFAULT_POLICY) -> Values:
     """(n,) volume of the defect that each piece belongs to, mm³.
 
     Pieces within `one_defect_mm` of each other are one defect: crossing lines that were skipped
@@ -61,13 +61,15 @@ def _skipped(pieces: Sequence[Piece]) -> Mask:
     return np.array([piece.skipped for piece in pieces], dtype=bool)
 
 
-def worth_mending(pieces: Sequence[Piece], options: PolicyOptions = USUAL_POLICY) -> Mask:
+def worth_mending(pieces: Sequence[Piece], options: PolicyOptions = DEFAULT_POLICY) -> Mask:
     """(n,) whether each piece belongs to a defect that is worth a repair (see `defect_volumes`)."""
     least_mm3 = np.where(_skipped(pieces), options.least_skipped_mm3, options.least_mm3)
     return np.asarray(defect_volumes(pieces, options) >= least_mm3)
 
 
-def to_fill(regions: Sequence[Region], options: PolicyOptions = USUAL_POLICY) -> tuple[Region, ...]:
+def to_fill(
+    regions: Sequence[Region], options: PolicyOptions = DEFAULT_POLICY
+) -> tuple[Region, ...]:
     """The missing regions that are worth a repair, alone or together with others near them."""
     missing = [region for region in regions if region.label is Label.MISSING]
     keep = worth_mending([Piece.of(region) for region in missing], options)
@@ -80,7 +82,7 @@ def volume_mm3(regions: Sequence[Region]) -> float:
 
 
 def too_much(
-    regions: Sequence[Region], layer_mm: float, options: PolicyOptions = USUAL_POLICY
+    regions: Sequence[Region], layer_mm: float, options: PolicyOptions = DEFAULT_POLICY
 ) -> tuple[Region, ...]:
     """The regions of excess that are large and high enough to matter."""
     return tuple(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from amrepair.deficit.options import USUAL_DEFICIT
+from amrepair.deficit.options import DEFAULT_DEFICIT
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class PolicyOptions:
     least_mm3: float = 1.0
     least_skipped_mm3: float = 0.6
     line_mm3: float = 0.15
-    crumb_mm3: float = USUAL_DEFICIT.bead_mm3
+    crumb_mm3: float = DEFAULT_DEFICIT.bead_mm3
     one_defect_mm: float = 1.0
     least_excess_mm3: float = 2.0
     excess_layers: float = 2.0
@@ -83,5 +83,5 @@ class PolicyOptions:
     left_ratio: float = 0.08
 
 
-USUAL_POLICY = PolicyOptions()
+DEFAULT_POLICY = PolicyOptions()
 """The default of the loop and the command line."""

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from amrepair.errors import InputError
-from amrepair.policy.options import USUAL_POLICY, PolicyOptions
+from amrepair.policy.options import DEFAULT_POLICY, PolicyOptions
 from amrepair.policy.table import Action, Cover, Decision, Finding, Situation, decide, judge
 from amrepair.policy.table import gravest as gravest_of
 from amrepair.regions.anomaly import DefectType
@@ -18,7 +18,7 @@ _MEANT: dict[str, type[DefectType] | type[Cover] | type[Action]] = {
 }  # fmt: skip
 
 
-def decided_again(recorded: Mapping[str, Any], options: PolicyOptions = USUAL_POLICY) -> Decision:
+def decided_again(recorded: Mapping[str, Any], options: PolicyOptions = DEFAULT_POLICY) -> Decision:
     """Decide again from the facts that a decision recorded (`Decision.to_json`).
 
     The facts stay as they were recorded, even those that were themselves derived by the options of

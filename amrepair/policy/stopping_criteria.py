@@ -5,15 +5,15 @@ Another pass is not worth it when the last one changed nearly nothing, or when l
 
 from __future__ import annotations
 
-from amrepair.policy.options import USUAL_POLICY, PolicyOptions
+from amrepair.policy.options import DEFAULT_POLICY, PolicyOptions
 
 
-def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
+def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = DEFAULT_POLICY) -> bool:
     """Whether the last repair left nearly all of what was missing before it."""
     return left_mm3 > options.stuck_ratio * before_mm3
 
 
-def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = USUAL_POLICY) -> bool:
+def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = DEFAULT_POLICY) -> bool:
     """Whether little of what was found is left: a further pass would mostly add rims."""
     return left_mm3 <= options.little_ratio * found_mm3
 
@@ -24,7 +24,7 @@ def may_be_left(
     missing_mm3: float,
     excess_mm3: float,
     excess_before_mm3: float,
-    options: PolicyOptions = USUAL_POLICY,
+    options: PolicyOptions = DEFAULT_POLICY,
 ) -> bool:
     """Whether what is left at a stop is within tolerance, so that the job may go on.
 

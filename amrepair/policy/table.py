@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any
 
-from amrepair.policy.options import USUAL_POLICY, PolicyOptions
+from amrepair.policy.options import DEFAULT_POLICY, PolicyOptions
 from amrepair.policy.remedies import Way
 from amrepair.regions.anomaly import DefectType
 
@@ -154,7 +154,7 @@ class Condition:
     test: str
     value: Any
 
-    def fits(self, facts: Finding | Situation, options: PolicyOptions = USUAL_POLICY) -> bool:
+    def fits(self, facts: Finding | Situation, options: PolicyOptions = DEFAULT_POLICY) -> bool:
         """Whether the condition holds."""
         found = getattr(facts, self.fact)
         if self.test == "is":
@@ -180,7 +180,7 @@ class Condition:
         if self.test == "is":
             return f"{self._name()} is {self.value}"
         unit = _QUANTITY_UNITS.get(self.fact, "")
-        return f"{self._name()} {self.test} {self.limit(USUAL_POLICY):g}{unit}"
+        return f"{self._name()} {self.test} {self.limit(DEFAULT_POLICY):g}{unit}"
 
     def _name(self) -> str:
         return _QUANTITY_NAMES.get(self.fact, self.fact)
@@ -228,7 +228,7 @@ class Row:
     when: tuple[Condition, ...]
     reason: str
 
-    def fits(self, facts: Finding | Situation, options: PolicyOptions = USUAL_POLICY) -> bool:
+    def fits(self, facts: Finding | Situation, options: PolicyOptions = DEFAULT_POLICY) -> bool:
         """Whether all conditions of the row hold."""
         return all(condition.fits(facts, options) for condition in self.when)
 
@@ -415,7 +415,7 @@ class Decision:
         }  # fmt: skip
 
 
-def judge(finding: Finding, options: PolicyOptions = USUAL_POLICY) -> Verdict:
+def judge(finding: Finding, options: PolicyOptions = DEFAULT_POLICY) -> Verdict:
     """Decide about one finding, by the first row that fits."""
     row = next(row for row in FINDINGS if row.fits(finding, options))
     return Verdict(finding, row.action, row.id, row.reason)
@@ -427,7 +427,7 @@ def gravest(verdicts: Sequence[Verdict]) -> Action:
 
 
 def decide(
-    verdicts: Sequence[Verdict], situation: Situation, options: PolicyOptions = USUAL_POLICY
+    verdicts: Sequence[Verdict], situation: Situation, options: PolicyOptions = DEFAULT_POLICY
 ) -> Decision:
     """Decide what happens at the stop.
 

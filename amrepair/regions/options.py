@@ -103,7 +103,7 @@ class SkippedOptions:
     sunk_share: float = 0.25
 
 
-USUAL_SKIPPED = SkippedOptions()
+DEFAULT_SKIPPED = SkippedOptions()
 """The default of the deficit."""
 
 

@@ -17,7 +17,7 @@ from amrepair.observe.rays import rays_crossing
 from amrepair.regions.bead_paths import BeadPaths, best_mean
 from amrepair.regions.bead_samples import BeadSamples
 from amrepair.regions.beads_as_laid import UP
-from amrepair.regions.options import USUAL_SKIPPED, SkippedOptions
+from amrepair.regions.options import DEFAULT_SKIPPED, SkippedOptions
 from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -28,7 +28,7 @@ def skipped(
     scan: Scan,
     evidence: Evidence,
     template: Template,
-    options: SkippedOptions = USUAL_SKIPPED,
+    options: SkippedOptions = DEFAULT_SKIPPED,
     *,
     over_mm: float = 0.0,
 ) -> PlannedBeads:

@@ -54,5 +54,5 @@ class RepairOptions:
     patch: PatchOptions = field(default_factory=PatchOptions)
 
 
-USUAL_REPAIR = RepairOptions()
+DEFAULT_REPAIR = RepairOptions()
 """The default of the loop and the command line."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from amrepair.align.registration import Registration
 from amrepair.deficit import Deficit
 from amrepair.frames import Transform
-from amrepair.policy import USUAL_POLICY, PolicyOptions, acceptance
+from amrepair.policy import DEFAULT_POLICY, PolicyOptions, acceptance
 from amrepair.regions import AnomalyMap, Region
 from amrepair.regions.error_calibration_fit import Sound
 from amrepair.scans import Scan
@@ -58,7 +58,7 @@ class RepairPlan:
     build_from_scan: Transform
     layer_height_mm: float
     scan: Scan
-    policy: PolicyOptions = USUAL_POLICY
+    policy: PolicyOptions = DEFAULT_POLICY
     patch: PatchPlan | None = None
     checked: CheckedProgram | None = None
     estimate: Estimate | None = None

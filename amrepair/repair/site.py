@@ -12,12 +12,12 @@ from amrepair.align.registration import Registration
 from amrepair.arrays import ColumnMask, Mask
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
-from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy import DEFAULT_POLICY, PolicyOptions
 from amrepair.regions import AnomalyMap, detect
 from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.error_calibration_fit import Sound
 from amrepair.regions.planned_beads import PlannedBeads
-from amrepair.repair.options import USUAL_REPAIR, RepairOptions
+from amrepair.repair.options import DEFAULT_REPAIR, RepairOptions
 from amrepair.scans import Scan
 from amrepair.template.laid import LaidBeads
 from amrepair.template.port import Template
@@ -167,8 +167,8 @@ class Site:
     finished: Finished | None = None
     laid: LaidBeads | None = None
     detector: Detector = detect
-    options: RepairOptions = USUAL_REPAIR
-    policy: PolicyOptions = USUAL_POLICY
+    options: RepairOptions = DEFAULT_REPAIR
+    policy: PolicyOptions = DEFAULT_POLICY
 
     @classmethod
     def of_part(

@@ -23,7 +23,7 @@ from amrepair.report.collect import (
     wire_counters,
 )
 from amrepair.report.data import Figures, ReportData, TemperatureSeries
-from amrepair.report.options import USUAL_PAGE
+from amrepair.report.options import DEFAULT_PAGE
 from amrepair.report.text import outcome_of
 from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
@@ -36,7 +36,7 @@ def plan_is_enough(plan: RepairPlan) -> bool:
     if plan.checked is None or plan.patch is None or plan.too_much:
         return False
     left_mm3 = plan.unreachable_mm3 + plan.unprintable_mm3
-    return left_mm3 <= USUAL_PAGE.left_out_ratio * plan.deficit.missing_mm3
+    return left_mm3 <= DEFAULT_PAGE.left_out_ratio * plan.deficit.missing_mm3
 
 
 def report_of_plan(

@@ -20,7 +20,7 @@ from amrepair.loop.afterwards import Afterwards
 from amrepair.loop.buried_defects import buried_mm3, pieces_of
 from amrepair.loop.findings import reach_of
 from amrepair.loop.learning import to_json
-from amrepair.observe.options import USUAL_BACKGROUND
+from amrepair.observe.options import DEFAULT_BACKGROUND
 from amrepair.policy.table import FINDINGS, STOP_ROWS
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
@@ -34,7 +34,7 @@ from amrepair.report.data import (
     SolidMesh,
 )
 from amrepair.report.left import left_parts
-from amrepair.report.options import USUAL_PAGE
+from amrepair.report.options import DEFAULT_PAGE
 from amrepair.report.text import NEGLIGIBLE_MM3, kind_name, plan_lines, quantity
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
@@ -298,9 +298,9 @@ def of_the_part(plan: RepairPlan) -> Mask:
     foot_mm = (
         float(anomaly.template_points_mm[:, 2].min()) if len(anomaly.template_points_mm) else 0
     )
-    flat = plan.scan.points_mm[:, 2] < foot_mm + USUAL_BACKGROUND.band_mm
+    flat = plan.scan.points_mm[:, 2] < foot_mm + DEFAULT_BACKGROUND.band_mm
     outside = anomaly.deviation_mm > anomaly.threshold_mm
-    far = anomaly.deviation_mm > USUAL_PAGE.stray_limits * anomaly.threshold_mm
+    far = anomaly.deviation_mm > DEFAULT_PAGE.stray_limits * anomaly.threshold_mm
     return ~(((flat & outside) | far) & (anomaly.label == int(Label.OK)))
 
 
@@ -309,7 +309,7 @@ def outlines_mm(plan: RepairPlan) -> tuple[Float[np.ndarray, "_ 2"], ...]:
     outlines = []
     for solid in (plan.deficit.missing, plan.deficit.excess):
         if not solid.is_empty():
-            smooth = solid.project().simplify(USUAL_PAGE.outline_mm)
+            smooth = solid.project().simplify(DEFAULT_PAGE.outline_mm)
             outlines += [np.asarray(ring, dtype=np.float64) for ring in smooth.to_polygons()]
     return tuple(outlines)
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from amrepair.align.thinning_kernels import morton_keys
 from amrepair.arrays import Numbers, Points
 from amrepair.report.data import SolidMesh
-from amrepair.report.options import USUAL_PAGE
+from amrepair.report.options import DEFAULT_PAGE
 
 SHADE_LEVELS = 16
 # Head-high light from where the first view looks, as drawings have it.
@@ -83,10 +83,10 @@ def shading(points_mm: Points, normals: Points | None, side: tuple[int, int] = (
     side
         Signs of X and Y of the corner that the light stands at.
     """
-    if len(points_mm) < USUAL_PAGE.shading_neighbours:
+    if len(points_mm) < DEFAULT_PAGE.shading_neighbours:
         return np.full(len(points_mm), SHADE_LEVELS - 1)
     if normals is None:
-        neighbours = cKDTree(points_mm).query(points_mm, k=USUAL_PAGE.shading_neighbours)[1]
+        neighbours = cKDTree(points_mm).query(points_mm, k=DEFAULT_PAGE.shading_neighbours)[1]
         around = points_mm[neighbours] - points_mm[neighbours].mean(axis=1, keepdims=True)
         axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
         # which side is out is not known, so the two sides of a face must look the same
@@ -106,8 +106,8 @@ def simplified(mesh: SolidMesh, *, budget: int) -> SolidMesh:
         )
     )
     if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
-        tolerance_mm = USUAL_PAGE.simplify_mm
-        for _ in range(USUAL_PAGE.simplify_steps):
+        tolerance_mm = DEFAULT_PAGE.simplify_mm
+        for _ in range(DEFAULT_PAGE.simplify_steps):
             reduced = solid.simplify(tolerance_mm)
             if reduced.num_tri() <= budget and not reduced.is_empty():
                 out = reduced.to_mesh()
@@ -124,7 +124,9 @@ def feature_edges(mesh: SolidMesh, *, budget: int) -> Int[np.ndarray, "e 2"]:
     drawn = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
     drawn.update_faces(drawn.area_faces > 0.0)
     angles_rad = np.asarray(drawn.face_adjacency_angles)
-    sharp = np.asarray(drawn.face_adjacency_edges)[angles_rad > np.deg2rad(USUAL_PAGE.feature_deg)]
+    sharp = np.asarray(drawn.face_adjacency_edges)[
+        angles_rad > np.deg2rad(DEFAULT_PAGE.feature_deg)
+    ]
     return sharp if len(sharp) <= budget else sharp[:0]
 
 

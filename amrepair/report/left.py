@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Faces
 from amrepair.report.data import LeftPart, SolidMesh
-from amrepair.report.options import USUAL_PAGE
+from amrepair.report.options import DEFAULT_PAGE
 from gcode.slicing.patch import LeftCause, LeftColumns
 
 LEFT_KEYS = {
@@ -30,7 +30,7 @@ def left_parts(left: tuple[LeftColumns, ...]) -> tuple[LeftPart, ...]:
     return tuple(sorted(parts, key=lambda part: -part.volume_mm3))
 
 
-def shape_of(columns: LeftColumns, most: int = USUAL_PAGE.left_boxes) -> SolidMesh:
+def shape_of(columns: LeftColumns, most: int = DEFAULT_PAGE.left_boxes) -> SolidMesh:
     """Boxes over columns; neighbours joined, as many as it takes, each as high as they are.
 
     A box lies about the mean of its columns' middles, and holds as much as they do.

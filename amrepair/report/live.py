@@ -16,7 +16,7 @@ from amrepair.repair import RepairPlan
 from amrepair.report import guarded
 from amrepair.report.collect import decision_of, look_label, of_the_part
 from amrepair.report.operator import Operator, OperatorAnswer
-from amrepair.report.options import USUAL_LIVE
+from amrepair.report.options import DEFAULT_LIVE
 from amrepair.report.text import plan_lines
 from gcode.errors import GcodeError
 from gcode.meshes import mesh_of
@@ -179,7 +179,7 @@ class LiveView:
     ) -> None:
         """Draw points, coloured by deviation where it is known; many are thinned."""
         self._look_at(points_mm)
-        step = max(1, -(-len(points_mm) // USUAL_LIVE.points))
+        step = max(1, -(-len(points_mm) // DEFAULT_LIVE.points))
         colours: Any = (140, 146, 152)
         if deviation_mm is not None:
             colours = deviation_colours(np.asarray(deviation_mm[::step]), range_mm)
@@ -187,7 +187,7 @@ class LiveView:
             f"/{name}",
             self._local(points_mm[::step]),
             colours,
-            point_size=USUAL_LIVE.point_mm,
+            point_size=DEFAULT_LIVE.point_mm,
             precision="float32",
         )
         self._switch(name, handle)
@@ -199,13 +199,13 @@ class LiveView:
         if not len(start_mm):
             return None
         self._look_at(start_mm)
-        step = max(1, -(-len(start_mm) // USUAL_LIVE.segments))
+        step = max(1, -(-len(start_mm) // DEFAULT_LIVE.segments))
         ends = np.stack([start_mm[::step], end_mm[::step]], axis=1)
         return self.server.scene.add_line_segments(
             f"/{name}",
             self._local(ends.reshape(-1, 3)).reshape(-1, 2, 3),
             colour,
-            thickness=USUAL_LIVE.bead_mm,
+            thickness=DEFAULT_LIVE.bead_mm,
         )
 
     def show_toolpath(self, name: str, toolpath: Toolpath) -> None:
@@ -222,7 +222,7 @@ class LiveView:
         """Hand over a job: its beads appear as they are printed, or at once (`grown`)."""
         beads = job.beads
         real = np.flatnonzero(beads.layer >= 0)
-        for k, part in enumerate(np.array_split(real, min(USUAL_LIVE.job_steps, len(real)))):
+        for k, part in enumerate(np.array_split(real, min(DEFAULT_LIVE.job_steps, len(real)))):
             handle = self.show_segments(
                 f"{name}/{k}", beads.start_mm[part], beads.end_mm[part], JOB_RGB
             )

@@ -71,7 +71,7 @@ class PageOptions:
     left_out_ratio: float = 0.05
 
 
-USUAL_PAGE = PageOptions()
+DEFAULT_PAGE = PageOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,4 +97,4 @@ class LiveOptions:
     bead_mm: float = 0.35
 
 
-USUAL_LIVE = LiveOptions()
+DEFAULT_LIVE = LiveOptions()

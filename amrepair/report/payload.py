@@ -14,7 +14,7 @@ import numpy as np
 from amrepair.frames import in_box
 from amrepair.report import encode
 from amrepair.report.data import BeadPath, ReportData, ReportLook, SolidMesh
-from amrepair.report.options import USUAL_PAGE
+from amrepair.report.options import DEFAULT_PAGE
 
 AGREES_LABEL, MISSING_LABEL, EXCESS_LABEL = 0, 1, 2
 
@@ -53,14 +53,14 @@ def payload(data: ReportData) -> Json:
 def drawn_looks(data: ReportData) -> tuple[int, ...]:
     """Indices of the looks that are drawn in 3D: all, or those where something happened."""
     count = len(data.looks)
-    if count <= USUAL_PAGE.looks:
+    if count <= DEFAULT_PAGE.looks:
         return tuple(range(count))
     importance = [
         (look.beads is not None, look.missing_mm3 + look.excess_mm3, -index)
         for index, look in enumerate(data.looks)
     ]
     ranked = sorted(range(1, count - 1), key=lambda index: importance[index], reverse=True)
-    return tuple(sorted({0, count - 1, *ranked[: USUAL_PAGE.looks - 2]}))
+    return tuple(sorted({0, count - 1, *ranked[: DEFAULT_PAGE.looks - 2]}))
 
 
 def compared(data: ReportData, drawn: tuple[int, ...]) -> tuple[int, int]:
@@ -90,7 +90,7 @@ def facing(data: ReportData, drawn: tuple[int, ...], box_mm: np.ndarray) -> tupl
         return -1, -1
     away = defect.vertices_mm.mean(axis=0) - box_mm.mean(axis=0)
     x, y = (
-        1 if away[axis] > USUAL_PAGE.aside_ratio * np.ptp(box_mm[:, axis]) else -1
+        1 if away[axis] > DEFAULT_PAGE.aside_ratio * np.ptp(box_mm[:, axis]) else -1
         for axis in (0, 1)
     )
     return x, y
@@ -152,11 +152,11 @@ def nice_ceiling(value: float) -> float:
 
 
 def _look(look: ReportLook, index: int, share: int, scale_mm: float, side: tuple[int, int]) -> Json:
-    budget = min(USUAL_PAGE.points_per_look, USUAL_PAGE.points // share)
+    budget = min(DEFAULT_PAGE.points_per_look, DEFAULT_PAGE.points // share)
     kept = encode.thinned(look.points_mm, look.label_of_point != AGREES_LABEL, budget=budget)
     points_mm = look.points_mm[kept]
     normals = None if look.normals is None else look.normals[kept]
-    faces = USUAL_PAGE.faces // (2 * share)
+    faces = DEFAULT_PAGE.faces // (2 * share)
     return {
         "index": index,
         "label": html.escape(look.label),
@@ -171,7 +171,7 @@ def _look(look: ReportLook, index: int, share: int, scale_mm: float, side: tuple
         "excess": _solid(look.excess, faces),
         **{part.key: _boxes(part.shape) for part in look.left},
         "unseen": _unseen(look.unseen_mm),
-        "beads": None if look.beads is None else _beads(look.beads, USUAL_PAGE.beads // share),
+        "beads": None if look.beads is None else _beads(look.beads, DEFAULT_PAGE.beads // share),
         "histogram": _histogram(look, scale_mm),
         "noise": {
             "told": html.escape(look.noise),
@@ -187,7 +187,7 @@ def _unseen(points_mm: np.ndarray | None) -> Json | None:
         return None
     everything = np.zeros(len(points_mm), dtype=np.bool_)
     return encode.quantised(
-        points_mm[encode.thinned(points_mm, everything, budget=USUAL_PAGE.unseen_per_look)]
+        points_mm[encode.thinned(points_mm, everything, budget=DEFAULT_PAGE.unseen_per_look)]
     )
 
 
@@ -205,11 +205,11 @@ def _boxes(mesh: SolidMesh) -> Json:
 def _expected(mesh: SolidMesh) -> Json | None:
     if len(mesh.faces) == 0:
         return None
-    small = encode.simplified(mesh, budget=USUAL_PAGE.expected_faces)
+    small = encode.simplified(mesh, budget=DEFAULT_PAGE.expected_faces)
     return {
         "vertices": encode.quantised(small.vertices_mm),
         "faces": encode.integers(small.faces),
-        "edges": encode.integers(encode.feature_edges(small, budget=USUAL_PAGE.expected_edges)),
+        "edges": encode.integers(encode.feature_edges(small, budget=DEFAULT_PAGE.expected_edges)),
     }
 
 
@@ -237,12 +237,12 @@ def _beads(beads: BeadPath, budget: int) -> Json:
 
 def _histogram(look: ReportLook, scale_mm: float) -> Json:
     """Counts of all points; what lies beyond the scale is in the outermost bins."""
-    edges_mm = np.linspace(-scale_mm, scale_mm, USUAL_PAGE.histogram_bins + 1)
+    edges_mm = np.linspace(-scale_mm, scale_mm, DEFAULT_PAGE.histogram_bins + 1)
     inside = np.clip(look.deviation_mm, -scale_mm * (1 - 1e-9), scale_mm * (1 - 1e-9))
     counts, _ = np.histogram(inside, bins=edges_mm)
     return {
         "low": -scale_mm,
-        "step": 2 * scale_mm / USUAL_PAGE.histogram_bins,
+        "step": 2 * scale_mm / DEFAULT_PAGE.histogram_bins,
         "counts": counts.tolist(),
         "beyond": int((np.abs(look.deviation_mm) > scale_mm).sum()),
     }
@@ -254,7 +254,7 @@ def _heights(look: ReportLook, share: int) -> Json | None:
     if heights is None:
         return None
     ny, nx = heights.shape
-    block = max(1, math.ceil(math.sqrt(ny * nx * share / USUAL_PAGE.cells)))
+    block = max(1, math.ceil(math.sqrt(ny * nx * share / DEFAULT_PAGE.cells)))
     pad = ((0, -ny % block), (0, -nx % block))
     z_mm = np.pad(heights.z_mm, pad, mode="edge")
     seen = np.pad(heights.seen, pad, mode="edge")
@@ -279,7 +279,7 @@ def _heights(look: ReportLook, share: int) -> Json | None:
 def _series(
     name: str, time_s: np.ndarray, measured_c: np.ndarray, target_c: np.ndarray | None
 ) -> Json:
-    step = max(1, math.ceil(len(time_s) / USUAL_PAGE.samples))
+    step = max(1, math.ceil(len(time_s) / DEFAULT_PAGE.samples))
     return {
         "name": html.escape(name),
         "time": [_rounded(float(v)) for v in time_s[::step]],

@@ -32,7 +32,7 @@ class PlacementOptions:
     line_mm: float = 0.05
 
 
-USUAL_PLACEMENT = PlacementOptions()
+DEFAULT_PLACEMENT = PlacementOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class ReplayOptions:
     tries: int = 24
 
 
-USUAL_REPLAY = ReplayOptions()
+DEFAULT_REPLAY = ReplayOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class RecordingOptions:
     steepest_deg: float = 80.0
 
 
-USUAL_RECORDING = RecordingOptions()
+DEFAULT_RECORDING = RecordingOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,4 +116,4 @@ class TruthOptions:
     hidden_mm: float = 0.5
 
 
-USUAL_TRUTH = TruthOptions()
+DEFAULT_TRUTH = TruthOptions()

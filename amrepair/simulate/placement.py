@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from amrepair.arrays import Values, Vector
 from amrepair.errors import InputError
-from amrepair.simulate.options import USUAL_PLACEMENT
+from amrepair.simulate.options import DEFAULT_PLACEMENT
 from amrepair.simulate.placed import Defect, PlacedDefect, Printed
 from gcode.meshes import box_of_solid
 from gcode.reader.job import Beads
@@ -31,7 +31,9 @@ def _layer_ranges(defect: Defect, tops_mm: Values, rng: np.random.Generator) -> 
         return [range(max(0, asked - count + 1), asked + 1)]
     first_last = min(count + 1, len(tops_mm) - 1)  # the first two layers hold the part: not there
     lasts = rng.permutation(np.arange(first_last, max(first_last + 1, len(tops_mm) - 1)))
-    return [range(int(last) - count + 1, int(last) + 1) for last in lasts[: USUAL_PLACEMENT.tries]]
+    return [
+        range(int(last) - count + 1, int(last) + 1) for last in lasts[: DEFAULT_PLACEMENT.tries]
+    ]
 
 
 def _z_range(layers: range, tops_mm: Values) -> tuple[float, float]:
@@ -95,7 +97,7 @@ def void(
     for layers in _layer_ranges(defect, tops_mm, rng):
         room = _solid_through(part, layers, tops_mm)
         room = room.offset(-(wall_mm + long_mm), m3.JoinType.Round, circular_segments=32)
-        if room.area() < USUAL_PLACEMENT.least_room_mm2:
+        if room.area() < DEFAULT_PLACEMENT.least_room_mm2:
             continue
         centre = random_point(room, rng)
         if centre is None:
@@ -159,7 +161,7 @@ def missing_beads(
             found = _stretches(beads, mine, centre, count, 0.5 * defect.values["length"] * scale)
             thick_mm = tops_mm[layer] - (tops_mm[layer - 1] if layer else 0.0)
             z_low, z_high = tops_mm[layer] - 0.5 * thick_mm, tops_mm[layer] + 0.25 * thick_mm
-            regions += [[*row, USUAL_PLACEMENT.line_mm, z_low, z_high, 0.0] for row in found]
+            regions += [[*row, DEFAULT_PLACEMENT.line_mm, z_low, z_high, 0.0] for row in found]
         if len(regions) < count * len(layers):
             continue
         rows = np.array(regions)
@@ -185,7 +187,7 @@ def _stretches(
     """x, y, cos, sin, half-length of the parts of the nearest long lines that lie by `centre`."""
     start, end = beads.start_mm[mine, :2], beads.end_mm[mine, :2]
     length = np.linalg.norm(end - start, axis=1)
-    long_ = length >= USUAL_PLACEMENT.least_line_mm
+    long_ = length >= DEFAULT_PLACEMENT.least_line_mm
     start, end, length = start[long_], end[long_], length[long_]
     along = (end - start) / length[:, None]
     at = np.clip(((centre - start) * along).sum(axis=1), 0.0, length)
@@ -203,7 +205,7 @@ def _even(part: m3.Manifold, layers: range, tops_mm: Values) -> bool:
     room = _solid_through(part, layers, tops_mm).area()
     bottoms = np.concatenate([[0.0], tops_mm[:-1]])
     areas = [part.slice(float(0.5 * (bottoms[k] + tops_mm[k]))).area() for k in layers]
-    return bool(room >= USUAL_PLACEMENT.even_ratio * max(areas))
+    return bool(room >= DEFAULT_PLACEMENT.even_ratio * max(areas))
 
 
 def _bite(
@@ -251,7 +253,7 @@ def chip(
     ends = np.concatenate([np.roll(o, -1, axis=0) for o in outlines])
     weight = np.concatenate(lengths)
     whole = len(part.decompose())  # parts of several bodies, or with closed cavities
-    for _ in range(USUAL_PLACEMENT.tries):
+    for _ in range(DEFAULT_PLACEMENT.tries):
         pick = int(rng.choice(len(starts), p=weight / weight.sum()))
         on_edge = starts[pick] + rng.random() * (ends[pick] - starts[pick])
         centre = np.array([*on_edge, height_mm])
@@ -263,7 +265,7 @@ def chip(
             continue
         pieces = (part - bite).decompose()
         # A piece that falls off with the bite would lie loose on the bed: that is no chip.
-        if sum(abs(piece.volume()) > USUAL_PLACEMENT.least_piece_mm3 for piece in pieces) > whole:
+        if sum(abs(piece.volume()) > DEFAULT_PLACEMENT.least_piece_mm3 for piece in pieces) > whole:
             continue
         box = box_of_solid(broken)
         grow_mm = np.array([0.5, 0.5, 0.5])  # the print stands a little off the CAD

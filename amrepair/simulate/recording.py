@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from amrepair.arrays import PlanePoints, Values
 from amrepair.errors import InputError
-from amrepair.simulate.options import USUAL_RECORDING
+from amrepair.simulate.options import DEFAULT_RECORDING
 
 RECORDING_VERSION = 1
 SIGMA_OF_MAD = 1.4826  # normal distribution
@@ -68,7 +68,7 @@ def edge_distance_mm(plane_mm: PlanePoints, depth_mm: Values, cell_mm: float) ->
     depth = np.full(tuple(at.max(axis=0) + 2), np.nan)
     depth[at[:, 0], at[:, 1]] = depth_mm
     edge = ~np.isfinite(depth)
-    steep_mm = np.tan(np.deg2rad(USUAL_RECORDING.steepest_deg)) * cell_mm
+    steep_mm = np.tan(np.deg2rad(DEFAULT_RECORDING.steepest_deg)) * cell_mm
     for axis in range(2):
         step = np.abs(np.diff(depth, axis=axis)) > steep_mm
         before = [slice(None)] * 2
@@ -146,8 +146,8 @@ def _wrong(content: dict[str, np.ndarray]) -> str:
     known = np.isfinite(content["residual_mm"])
     if not known.any():
         return "residual_mm has no finite value"
-    if float(np.abs(content["residual_mm"][known]).max()) > USUAL_RECORDING.farthest_mm:
-        return f"residual_mm goes beyond {USUAL_RECORDING.farthest_mm:g}"
+    if float(np.abs(content["residual_mm"][known]).max()) > DEFAULT_RECORDING.farthest_mm:
+        return f"residual_mm goes beyond {DEFAULT_RECORDING.farthest_mm:g}"
     cosine, edge = content["cosine"][known], content["edge_mm"][known]
     if not (np.isfinite(cosine).all() and cosine.min() >= 0.0 and cosine.max() <= 1.0):
         return "cosine is not 0 to 1 wherever there is a residual"

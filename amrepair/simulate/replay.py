@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from amrepair.arrays import Numbers, PlanePoints, Points, Values, Vector
 from amrepair.frames import unit_vectors
-from amrepair.simulate.options import USUAL_REPLAY
+from amrepair.simulate.options import DEFAULT_REPLAY
 from amrepair.simulate.recording import Recording, edge_distance_mm
 
 
@@ -68,7 +68,7 @@ class Replay:
         self._offset_mm = recording.offset_mm
         self._residual_mm = recording.residual_mm
         known = np.isfinite(recording.residual_mm)
-        by_edge = known & (recording.edge_mm < USUAL_REPLAY.spot_edge_mm)
+        by_edge = known & (recording.edge_mm < DEFAULT_REPLAY.spot_edge_mm)
         away = known & ~by_edge
         found = [_kind(recording, mask) for mask in (away, by_edge)]
         # A recording without edges says nothing about them.
@@ -116,8 +116,8 @@ class Replay:
         self, plane_mm: PlanePoints, cosine: Values, edge_mm: Values, rng: np.random.Generator
     ) -> Values:
         """(n,) recorded residuals for points of an image plane, by incidence and edges."""
-        by_edge = (edge_mm < USUAL_REPLAY.spot_edge_mm).astype(np.int64)
-        shifted = (plane_mm - plane_mm.min(axis=0)) / USUAL_REPLAY.block_mm + rng.random(2)
+        by_edge = (edge_mm < DEFAULT_REPLAY.spot_edge_mm).astype(np.int64)
+        shifted = (plane_mm - plane_mm.min(axis=0)) / DEFAULT_REPLAY.block_mm + rng.random(2)
         _, block = np.unique(np.floor(shifted).astype(np.int64), axis=0, return_inverse=True)
         block = block.ravel()
         count = np.bincount(block)
@@ -137,7 +137,7 @@ class Replay:
                 _Piece(
                     _turned(rng), _like(kind, wanted.cosine[first], rng), wanted.middle_mm[first]
                 )
-                for _ in range(USUAL_REPLAY.tries)
+                for _ in range(DEFAULT_REPLAY.tries)
             ]
             fits = [self._met(piece, wanted, todo) for piece in pieces]
             best = int(np.argmax([count[todo[fit]].sum() for fit in fits]))
@@ -159,12 +159,12 @@ class Replay:
         fits = np.ones(len(todo), dtype=bool)
         for k, kind in enumerate(self._kinds):
             share = wanted.edge_share[todo] if k else 1.0 - wanted.edge_share[todo]
-            fits &= (kind.reach_mm[view, row, column] <= USUAL_REPLAY.near_mm[k]) | (
-                share < USUAL_REPLAY.least_share
+            fits &= (kind.reach_mm[view, row, column] <= DEFAULT_REPLAY.near_mm[k]) | (
+                share < DEFAULT_REPLAY.least_share
             )
         cosine = self._kinds[0].cosine[view, row, column]
         return np.asarray(
-            fits & (np.abs(cosine - wanted.cosine[todo]) <= USUAL_REPLAY.similar_cosine)
+            fits & (np.abs(cosine - wanted.cosine[todo]) <= DEFAULT_REPLAY.similar_cosine)
         )
 
     def _cells(self, piece: _Piece, plane_mm: PlanePoints) -> tuple[int, Numbers, Numbers]:
@@ -182,7 +182,7 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
     if not mask.any():
         return None
     pitch = recording.pitch_mm
-    size = max(1, round(USUAL_REPLAY.block_mm / pitch))
+    size = max(1, round(DEFAULT_REPLAY.block_mm / pitch))
     nearest = np.zeros((2, *mask.shape), dtype=np.int32)
     reach = np.full(mask.shape, np.inf)
     cosine = np.zeros(mask.shape)
@@ -192,7 +192,7 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
         away, nearest[:, k] = ndimage.distance_transform_edt(~there, return_indices=True)
         # Beyond the raster there is nothing: places clipped to its border hit nothing.
         reach[k] = ndimage.uniform_filter(
-            away * pitch, size, mode="constant", cval=USUAL_REPLAY.block_mm
+            away * pitch, size, mode="constant", cval=DEFAULT_REPLAY.block_mm
         )
         reach[k][[0, -1]], reach[k][:, [0, -1]] = np.inf, np.inf
         value = recording.cosine[k][nearest[0, k], nearest[1, k]]
@@ -206,7 +206,8 @@ def _kind(recording: Recording, mask: Bool[np.ndarray, "k ny nx"]) -> _Kind | No
 def _like(kind: _Kind, cosine: float, rng: np.random.Generator) -> Int[np.ndarray, " 3"]:
     """A recorded cell of a like angle of incidence; of the next where there is none."""
     low, high = np.searchsorted(
-        kind.ordered, [cosine - USUAL_REPLAY.similar_cosine, cosine + USUAL_REPLAY.similar_cosine]
+        kind.ordered,
+        [cosine - DEFAULT_REPLAY.similar_cosine, cosine + DEFAULT_REPLAY.similar_cosine],
     )
     if low == high:
         low = min(max(int(low) - 1, 0), len(kind.ordered) - 1)

@@ -31,12 +31,12 @@ from amrepair.loop import (
 from amrepair.loop.options import UNASKED
 from amrepair.loop.probing import Felt, PortFeeler, ProbeScanner
 from amrepair.loop.sites import sites
-from amrepair.policy import USUAL_POLICY, PolicyOptions
+from amrepair.policy import DEFAULT_POLICY, PolicyOptions
 from amrepair.repair import Stopwatch
 from amrepair.scans import PROBE, Scanner
 from amrepair.simulate.defects import Defect, PlacedDefect, place
 from amrepair.simulate.flow import noisy_flow
-from amrepair.simulate.options import USUAL_TRUTH
+from amrepair.simulate.options import DEFAULT_TRUTH
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.stage import DefectTruth, FeltStage, Stage
@@ -83,7 +83,7 @@ class PreparedRun:
     @property
     def by_beads(self) -> bool:
         """Whether layers are judged by the job's beads: their inside is planned to be open."""
-        return self.setup.process.infill_ratio < USUAL_TRUTH.solid_ratio
+        return self.setup.process.infill_ratio < DEFAULT_TRUTH.solid_ratio
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ def scale_to_fit(bounds_mm: Box, setup: PrintSetup) -> float:
     """Factor that makes a part fit the printer with a margin; never above 1."""
     size = bounds_mm[1] - bounds_mm[0]
     room = np.array([*setup.printer.bed_size_mm, setup.printer.max_z_mm])
-    return float(min(1.0, (USUAL_TRUTH.fit_share * room / size).min()))
+    return float(min(1.0, (DEFAULT_TRUTH.fit_share * room / size).min()))
 
 
 def prepare_run(
@@ -250,10 +250,10 @@ def set_stage(
         layer_height_mm=run.setup.process.layer_height_mm,
         part=run.part,
         box_mm=(
-            box[0] - USUAL_TRUTH.margin_mm,
-            box[1] - USUAL_TRUTH.margin_mm,
-            box[3] + USUAL_TRUTH.margin_mm,
-            box[4] + USUAL_TRUTH.margin_mm,
+            box[0] - DEFAULT_TRUTH.margin_mm,
+            box[1] - DEFAULT_TRUTH.margin_mm,
+            box[3] + DEFAULT_TRUTH.margin_mm,
+            box[4] + DEFAULT_TRUTH.margin_mm,
         ),
     )
 
@@ -262,7 +262,7 @@ def simulate_run(
     run: PreparedRun,
     *,
     wire_log: Path | None = None,
-    policy: PolicyOptions = USUAL_POLICY,
+    policy: PolicyOptions = DEFAULT_POLICY,
     approval: Approval = UNASKED,
     record: Callable[[Look], None] = lambda look: None,
     begun: Callable[[Transform, Printer], Tape] = lambda pose, printer: Tape(),

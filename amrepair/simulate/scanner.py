@@ -21,7 +21,7 @@ from amrepair.frames import Transform, in_box, rotation_from_vector, unit_vector
 from amrepair.scans.scan import Scan
 from amrepair.scans.scanner import ScanRequest
 from amrepair.simulate.columns import IntervalMap
-from amrepair.simulate.options import USUAL_TRUTH
+from amrepair.simulate.options import DEFAULT_TRUTH
 from amrepair.simulate.parameters import ScannerModel, WorldParameters
 from amrepair.simulate.recording import Recording
 from amrepair.simulate.replay import Replay
@@ -276,7 +276,7 @@ class SimulatedScanner:
                 self.world.cell_mm,
                 eye,
                 points,
-                USUAL_TRUTH.hidden_mm,
+                DEFAULT_TRUTH.hidden_mm,
             )
         )
 

@@ -20,7 +20,7 @@ from amrepair.loop.wire import Wire
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.columns import Columns, IntervalMap, Window
 from amrepair.simulate.defects import PlacedDefect
-from amrepair.simulate.options import USUAL_TRUTH
+from amrepair.simulate.options import DEFAULT_TRUTH
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from gcode.firmware.motion import MotionBatch
@@ -254,13 +254,13 @@ class Stage:
         if self._design is not None:
             extra = extra.minus(self._design)
         even = _even(standing, wanted, 0.5 * self._layer_height_mm)
-        around = np.array([[-1.0], [1.0]]) * USUAL_TRUTH.spreads_mm
+        around = np.array([[-1.0], [1.0]]) * DEFAULT_TRUTH.spreads_mm
         for wound in wounds:
             wound.filled_mm3 = sum(m.common(standing).volume_mm3 for m in wound.missing)
             added = extra.minus(wound.standing_out).clipped(wound.defect.box_mm + around)
             wound.added_mm3 = added.volume_mm3
             thickness_mm = sum(missing.thickness_mm() for missing in wound.missing)
-            over = np.asarray(thickness_mm) > USUAL_TRUTH.least_missing_mm
+            over = np.asarray(thickness_mm) > DEFAULT_TRUTH.least_missing_mm
             wound.surface_ratio = float(even[over].mean()) if over.any() else 1.0
 
     def _window(self) -> Window:

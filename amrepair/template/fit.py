@@ -20,7 +20,7 @@ from amrepair.frames import grid_points
 from amrepair.template.grid import Grid, GridSdf
 from amrepair.template.grid_kernels import NOBODY, carry, near_triangles, shared_nodes
 from amrepair.template.mesh_sdf import MeshSdf
-from amrepair.template.options import USUAL_FIT, FitOptions
+from amrepair.template.options import DEFAULT_FIT, FitOptions
 from amrepair.template.signs import signed_grid, signs_in_blocks
 from amrepair.template.surface import sample_surface
 from gcode.progress import Progress, silent
@@ -35,7 +35,7 @@ def fit_fast(
     seed: int = 0,
     least_residual_mm: float = 0.0,
     metadata: dict[str, str] | None = None,
-    options: FitOptions = USUAL_FIT,
+    options: FitOptions = DEFAULT_FIT,
     progress: Progress = silent,
 ) -> GridSdf:
     """Fit a template to an exact field.

@@ -23,7 +23,7 @@ from amrepair.template.mesh_file import file_sha256, load_mesh, require_mesh
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.network import NETWORK_KIND as NETWORK
 from amrepair.template.network import PaperSdf
-from amrepair.template.options import USUAL_FIT, FitOptions
+from amrepair.template.options import DEFAULT_FIT, FitOptions
 from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions, fit_paper
 from gcode.progress import Progress, silent
 
@@ -38,7 +38,7 @@ def fit_template(
     source: Path | str | trimesh.Trimesh | Sequence[Path],
     *,
     recipe: str = "fast",
-    fast: FitOptions = USUAL_FIT,
+    fast: FitOptions = DEFAULT_FIT,
     paper: PaperOptions = PUBLISHED_NETWORK,
     device: str = "auto",
     seed: int = 0,

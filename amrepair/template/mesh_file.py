@@ -18,7 +18,7 @@ from jaxtyping import Int
 
 from amrepair.arrays import Faces, Vertices
 from amrepair.errors import InputError, TemplateError
-from amrepair.template.options import USUAL_MESH, MeshOptions
+from amrepair.template.options import DEFAULT_MESH, MeshOptions
 from gcode.meshes import mesh_of
 from gcode.solids import (
     SOLID_SUFFIXES,
@@ -69,7 +69,7 @@ def file_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def load_mesh(path: Path | str, options: MeshOptions = USUAL_MESH) -> trimesh.Trimesh:
+def load_mesh(path: Path | str, options: MeshOptions = DEFAULT_MESH) -> trimesh.Trimesh:
     """Read a mesh and make it watertight where that leaves its shape in no doubt.
 
     Parameters
@@ -144,7 +144,7 @@ def edge_census(faces: Faces) -> EdgeCensus:
 
 
 def close_mesh(
-    mesh: trimesh.Trimesh, *, source: str, options: MeshOptions = USUAL_MESH
+    mesh: trimesh.Trimesh, *, source: str, options: MeshOptions = DEFAULT_MESH
 ) -> tuple[trimesh.Trimesh, tuple[str, ...]]:
     """Weld, orient and close a mesh; returns it with the sentences that say what was mended.
 

@@ -95,4 +95,4 @@ class PlannedOptions:
     most_voxels: int = 60_000_000
 
 
-USUAL_MESH, USUAL_FIT, USUAL_PLANNED = MeshOptions(), FitOptions(), PlannedOptions()
+DEFAULT_MESH, DEFAULT_FIT, DEFAULT_PLANNED = MeshOptions(), FitOptions(), PlannedOptions()

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from amrepair.arrays import Box, Points, Values, Vector, VoxelMask, Voxels
 from amrepair.errors import TemplateError
 from amrepair.template import planned_kernels as kernels
-from amrepair.template.options import USUAL_PLANNED, PlannedOptions
+from amrepair.template.options import DEFAULT_PLANNED, PlannedOptions
 from gcode.compiled import read_only
 
 
@@ -51,7 +51,7 @@ class PlannedSdf:
         height_mm: Values,
         *,
         level_mm: float | None = None,
-        options: PlannedOptions = USUAL_PLANNED,
+        options: PlannedOptions = DEFAULT_PLANNED,
     ) -> PlannedSdf:
         """Make the field of beads.
 

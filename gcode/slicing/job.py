@@ -26,7 +26,7 @@ from gcode.slicing.beads import Bead, loop_bead, spacing_of
 from gcode.slicing.layer_plan import LayerPlan, PartLayers, Unfilled
 from gcode.slicing.layers import LayerGrid, Slab, plan_slabs
 from gcode.slicing.objects import Labels, boxes_apart_mm
-from gcode.slicing.options import USUAL_PART, PartOptions
+from gcode.slicing.options import DEFAULT_PART, PartOptions
 from gcode.slicing.order import nearest_first, seamed
 from gcode.slicing.pen import MERGE_MM, Pen
 from gcode.slicing.regions import flattened, union
@@ -45,7 +45,7 @@ def slice_part(
     solid: Any,
     setup: PrintSetup,
     *,
-    options: PartOptions = USUAL_PART,
+    options: PartOptions = DEFAULT_PART,
     workers: int = 1,
     progress: Progress = silent,
     meanwhile: Callable[[], object] = nothing,
@@ -71,7 +71,7 @@ def plan_part(
     solid: Any,
     setup: PrintSetup,
     *,
-    options: PartOptions = USUAL_PART,
+    options: PartOptions = DEFAULT_PART,
     workers: int = 1,
     progress: Progress = silent,
     meanwhile: Callable[[], object] = nothing,

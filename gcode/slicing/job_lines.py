@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from gcode.moves import Role
 from gcode.slicing.beads import Bead
-from gcode.slicing.options import USUAL_PATCH, JobLineOptions
+from gcode.slicing.options import DEFAULT_PATCH, JobLineOptions
 from gcode.surfaces.lines import near_lines
 
 SAME_LEVEL_MM = 2e-3  # lines of one layer are as high, but for the text's last digits
@@ -213,7 +213,7 @@ def gathered(
     length_mm: Float[np.ndarray, " n"],
     middle_mm: Float[np.ndarray, "n 2"],
     width_mm: float,
-    options: JobLineOptions = USUAL_PATCH.lines,
+    options: JobLineOptions = DEFAULT_PATCH.lines,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """How much to lay in each piece of the job's lines.
 

@@ -18,7 +18,7 @@ from gcode.meshes import mesh_of
 from gcode.meshes_kernels import level_faces
 from gcode.profiles import PrintSetup
 from gcode.slicing import volume_kernels as kernels
-from gcode.slicing.options import USUAL_PART, PartOptions
+from gcode.slicing.options import DEFAULT_PART, PartOptions
 
 MAX_LAYERS = 20_000
 _SAME_LAYER_MM = 1e-4
@@ -105,7 +105,7 @@ def slab_volumes(solid: Any, cuts_mm: Float[np.ndarray, " n"]) -> Float[np.ndarr
 
 
 def plan_slabs(
-    solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float, options: PartOptions = USUAL_PART
+    solid: Any, grid: LayerGrid, *, nozzle_diameter_mm: float, options: PartOptions = DEFAULT_PART
 ) -> tuple[Slab, ...]:
     """Layers of a part on a grid that bends to the part's own horizontal faces.
 

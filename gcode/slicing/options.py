@@ -349,7 +349,7 @@ class PartOptions:
     other_mm: float = 1.5
 
 
-USUAL_PART = PartOptions()
+DEFAULT_PART = PartOptions()
 """The default for parts."""
 
 
@@ -368,5 +368,5 @@ class PatchOptions:
     fill: FillOptions = field(default_factory=FillOptions)
 
 
-USUAL_PATCH = PatchOptions()
+DEFAULT_PATCH = PatchOptions()
 """The default for repairs."""

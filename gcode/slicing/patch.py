@@ -24,7 +24,7 @@ from gcode.progress import Progress, silent
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.options import USUAL_PATCH, PatchOptions
+from gcode.slicing.options import DEFAULT_PATCH, PatchOptions
 from gcode.slicing.patch_laying import after_first, begin, emit, end, first_pass_words
 from gcode.slicing.patch_left import (
     NOT_CLOSED,
@@ -82,7 +82,7 @@ class PatchPlan:
     regions: tuple[PatchRegion, ...]
     first_pass: str
     left: tuple[LeftColumns, ...] = ()
-    options: PatchOptions = USUAL_PATCH
+    options: PatchOptions = DEFAULT_PATCH
 
 
 def slice_patch(
@@ -95,7 +95,7 @@ def slice_patch(
     start_mm: tuple[float, float, float] | None = None,
     hotend_c: float | None = None,
     lines: JobLines | None = None,
-    options: PatchOptions = USUAL_PATCH,
+    options: PatchOptions = DEFAULT_PATCH,
     progress: Progress = silent,
 ) -> PatchPlan:
     """Slice a deficit into beads that fill it.

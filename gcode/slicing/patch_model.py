@@ -12,7 +12,7 @@ from scipy import ndimage
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 from gcode.slicing.job_lines import JobColumns, JobLines
-from gcode.slicing.options import USUAL_PATCH, PatchOptions
+from gcode.slicing.options import DEFAULT_PATCH, PatchOptions
 from gcode.slicing.reach import Reach, cells_below
 from gcode.surfaces import HeightField
 from gcode.surfaces import raster_kernels as kernels
@@ -27,7 +27,7 @@ class PatchModel:
         setup: PrintSetup,
         as_built: HeightField,
         lines: JobLines | None = None,
-        options: PatchOptions = USUAL_PATCH,
+        options: PatchOptions = DEFAULT_PATCH,
     ) -> None:
         self.options = options
         self.deficit = deficit

@@ -13,7 +13,7 @@ import trimesh
 from amrepair.align.options import PUBLISHED_PAM, RELEASED_PAM
 from amrepair.bench.house import repair_distance
 from amrepair.bench.method import ClassInput
-from amrepair.bench.options import USUAL_HOUSE
+from amrepair.bench.options import DEFAULT_HOUSE
 from amrepair.bench.paper import BENCH_PAPER, make_pam_aligner, pam_options
 from amrepair.bench.runner import run_bench
 from amrepair.bench.samples import Format
@@ -46,8 +46,8 @@ def test_the_published_system_runs_by_name_and_says_what_was_shortened(
     quick = replace(PUBLISHED_PAM, ransac_iterations=20_000, threshold=1.0)
     monkeypatch.setattr("amrepair.bench.paper.TARGET_POINTS", 5_000)
     monkeypatch.setattr("amrepair.bench.paper.pam_options", lambda format: quick)
-    coarse = replace(USUAL_HOUSE, surface_spacing_mm=2.0)
-    monkeypatch.setattr("amrepair.bench.house.USUAL_HOUSE", coarse)
+    coarse = replace(DEFAULT_HOUSE, surface_spacing_mm=2.0)
+    monkeypatch.setattr("amrepair.bench.house.DEFAULT_HOUSE", coarse)
     options = SynthOptions(train=1, normal=1, per_defect=1, points=5000)
     data = synthesize([BRACKET], tmp_path / "set", "anomaly-shapenet", 0, options=options)
     short = replace(BENCH_PAPER, epochs=16, batch=256, rate=1e-3, dropout=0.0, width=128)

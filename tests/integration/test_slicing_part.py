@@ -14,7 +14,7 @@ from gcode.profiles.schema import MaterialProfile, ProcessProfile
 from gcode.profiles.setup import PrintSetup
 from gcode.slicing.infill import solid_fill
 from gcode.slicing.job import slice_part
-from gcode.slicing.options import USUAL_PART
+from gcode.slicing.options import DEFAULT_PART
 from gcode.writer import write
 from tests.unit.link_helpers import profile
 
@@ -98,8 +98,8 @@ def test_lines_of_a_solid_fill_carry_their_own_strip_and_no_more() -> None:
         angle_rad=np.pi / 4,
         role=Role.SOLID_INFILL,
         bore_mm=0.4,
-        options=USUAL_PART.fill,
-        overlap_ratio=USUAL_PART.overlap_ratio,
+        options=DEFAULT_PART.fill,
+        overlap_ratio=DEFAULT_PART.overlap_ratio,
     )
     lines = [bead for bead in beads if bead.role is Role.SOLID_INFILL]
     flow = np.concatenate([bead.share_mm for bead in lines]) / 0.407

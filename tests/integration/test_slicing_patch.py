@@ -18,7 +18,7 @@ from gcode.firmware.motion import MotionBatch
 from gcode.moves import Extrude, LayerChange, ModalState, Role, Toolpath
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.options import USUAL_PATCH
+from gcode.slicing.options import DEFAULT_PATCH
 from gcode.slicing.patch import NOT_CLOSED, PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
@@ -543,5 +543,5 @@ def test_no_more_plastic_is_laid_than_the_columns_ask_for() -> None:
     plan, _ = plan_of(bores)
     # columns may be laid as far over as floor and deficit disagree, a hundredth here
     assert plan.beads_mm3 == pytest.approx(
-        USUAL_PATCH.beads.bond_ratio * plan.reachable_mm3, rel=0.02
+        DEFAULT_PATCH.beads.bond_ratio * plan.reachable_mm3, rel=0.02
     )

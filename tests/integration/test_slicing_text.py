@@ -19,7 +19,7 @@ from gcode.moves import Extrude, ModalState, Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job import slice_part
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.options import USUAL_PART
+from gcode.slicing.options import DEFAULT_PART
 from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
@@ -182,7 +182,7 @@ def test_a_whole_part_is_combed_inside_its_walls() -> None:
     steps = [step for step in steps_of(program.text) if step.layer > 0]
     combed = 0
     for way in ways_of(steps):
-        across = [step for step in way if step.sideways_mm > USUAL_PART.short_travel_mm]
+        across = [step for step in way if step.sideways_mm > DEFAULT_PART.short_travel_mm]
         if any(step.e_mm < 0 for step in way):
             assert all(step.pulled_mm > 0 for step in across)
             continue

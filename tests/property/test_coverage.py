@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amrepair.merge.fuse import coverage_of
-from amrepair.merge.options import USUAL_FUSE
+from amrepair.merge.options import DEFAULT_FUSE
 
 SPACING_MM = 0.4
 EDGE_MM = 0.25  # of the meshes' triangles, at most
 # A disc of three spacings reaches so far past a random border by chance: 13 points would lie in
 # that cap of it, and the chance that none does is 2 in a million.
 BEYOND_MM = 2.5 * SPACING_MM
-REACH_MM = USUAL_FUSE.seen_spacings * SPACING_MM
+REACH_MM = DEFAULT_FUSE.seen_spacings * SPACING_MM
 
 
 def scattered(mesh: trimesh.Trimesh, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from amrepair.align import AlignOptions, Registration, align
 from amrepair.align.anywhere import Found
 from amrepair.align.clutter import Kept, noise_across, without_clutter
-from amrepair.align.options import THOROUGH, USUAL_ALIGN
+from amrepair.align.options import DEFAULT_ALIGN, THOROUGH
 from amrepair.align.refine import Refined
 from amrepair.align.search import spread_rotations
 from amrepair.errors import AlignmentError
@@ -45,7 +45,7 @@ def aligned(
     part: Points,
     clutter: Points,
     sigma_mm: float = SIGMA_MM,
-    options: AlignOptions = USUAL_ALIGN,
+    options: AlignOptions = DEFAULT_ALIGN,
 ) -> tuple[Registration, list[float]]:
     """The answer for both in one random pose, and how far off its poses leave the part."""
     rng = np.random.default_rng(7)

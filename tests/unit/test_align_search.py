@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.align import AlignOptions, Registration, align
 from amrepair.align.coarse import by_features
-from amrepair.align.options import PIECE, USUAL_ALIGN, CoarseOptions
+from amrepair.align.options import DEFAULT_ALIGN, PIECE, CoarseOptions
 from amrepair.align.search import CoarseField, search, spread_rotations
 from amrepair.align.thinning import Thinned, in_order, thin_out
 from amrepair.bench.bodies import pieces_of
@@ -44,7 +44,7 @@ QUICK_ALONE = AlignOptions(coarse=CoarseOptions(thorough=CoarseOptions().quick))
 
 
 def aligned(
-    template: AnalyticTemplate, points: Points, seed: int = 0, options: AlignOptions = USUAL_ALIGN
+    template: AnalyticTemplate, points: Points, seed: int = 0, options: AlignOptions = DEFAULT_ALIGN
 ) -> tuple[Registration, float]:
     """The answer for the points in a random pose, and how far it leaves them from their place."""
     rng = np.random.default_rng(seed)

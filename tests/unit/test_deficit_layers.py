@@ -9,7 +9,7 @@ import trimesh
 
 from amrepair.deficit import Deficit, compute_deficit
 from amrepair.frames import Transform
-from amrepair.policy import USUAL_POLICY
+from amrepair.policy import DEFAULT_POLICY
 from amrepair.policy.acceptance import Piece, worth_mending
 from amrepair.regions import detect
 from amrepair.scans import ScanRequest
@@ -124,7 +124,7 @@ def test_pieces_side_by_side_are_one_defect_and_crumbs_join_nothing() -> None:
         box_mm = np.array([[x_mm, 0.0, 0.0], [x_mm + 1.0, 1.0, 0.2]])
         return Piece(box_mm, volume_mm3, skipped=False)
 
-    share = 0.4 * USUAL_POLICY.least_mm3
+    share = 0.4 * DEFAULT_POLICY.least_mm3
     kept = worth_mending([piece(x_mm, share) for x_mm in (0.0, 1.5, 3.0, 20.0)])
     assert kept.tolist() == [True, True, True, False]
     assert not worth_mending([piece(0.1 * k, 0.03) for k in range(100)]).any()

@@ -17,7 +17,7 @@ from amrepair.frames import Transform
 from amrepair.regions import detect
 from amrepair.regions.bead_paths import BeadPaths
 from amrepair.regions.beads_as_laid import wall_shift_mm
-from amrepair.regions.options import USUAL_SKIPPED
+from amrepair.regions.options import DEFAULT_SKIPPED
 from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.regions.skipped import skipped
 from amrepair.scans import Scan
@@ -155,7 +155,7 @@ def test_in_the_first_layers_all_walls_tell_that_a_part_lies_aside(gone: bool, s
     evidence = detect(scan, planned, top_z_mm=high_mm).evidence
     assert evidence is not None
     middle = np.array([[x, 0.5 * WIDE_MM, 2.5 * HIGH_MM] for x in np.linspace(1.0, 23.0, 30)])
-    moved = wall_shift_mm(middle, evidence, planned, USUAL_SKIPPED)
+    moved = wall_shift_mm(middle, evidence, planned, DEFAULT_SKIPPED)
     # cells on rims hold points of the top, too: most of it is found, and never more
     share = moved[:, :2] / aside_mm
     assert (share > 0.3).all()
@@ -389,18 +389,18 @@ def test_a_stretch_goes_on_round_a_corner_as_long_as_samples_say_open(open_again
     start = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0], [20.0, 0.0, 1.0]])
     end = np.array([[10.0, 0.0, 1.0], [10.0, 8.0, 1.0], [30.0, 0.0, 1.0]])  # the last is apart
     lines = PlannedBeads(start, end, np.full(3, WIDE_MM), np.full(3, HIGH_MM))
-    paths = BeadPaths.of(lines, USUAL_SKIPPED)
+    paths = BeadPaths.of(lines, DEFAULT_SKIPPED)
     along_mm = paths.at_mm
     gone = np.where((along_mm > 6.0) & (along_mm < 14.0), 0.2, -1.0)
     gone[np.argmin(np.abs(along_mm - 10.6))] = -0.1  # one sample among others
     gone[along_mm > 18.0] = 0.2 if open_again else -1.0  # not joined: nothing was seen to begin
     kept = (along_mm > 6.5) & (along_mm < 8.2)
-    grown = paths.grown(kept, gone, USUAL_SKIPPED)
+    grown = paths.grown(kept, gone, DEFAULT_SKIPPED)
     assert not grown[along_mm > 18.0].any()
     far_mm = along_mm[grown]
     assert (far_mm.min(), far_mm.max()) == pytest.approx((6.0, 14.0), abs=0.3)
     assert grown[(along_mm > 6.3) & (along_mm < 13.7)].all()
-    assert not paths.grown(np.zeros_like(kept), gone, USUAL_SKIPPED).any()
+    assert not paths.grown(np.zeros_like(kept), gone, DEFAULT_SKIPPED).any()
     found = paths.stretches(grown)
     assert len(found.width_mm) == 2
     assert found.end_mm[0] == pytest.approx([10.0, 0.0, 1.0], abs=1e-6)
@@ -417,15 +417,15 @@ def test_a_stretch_goes_on_through_what_is_too_short_to_begin_one() -> None:
         np.vstack([corners[a:b], alone[k : k + 1]]) for k, a, b in ((0, 0, -1), (1, 1, 5))
     )
     paths = BeadPaths.of(
-        PlannedBeads(start, end, np.full(5, WIDE_MM), np.full(5, HIGH_MM)), USUAL_SKIPPED
+        PlannedBeads(start, end, np.full(5, WIDE_MM), np.full(5, HIGH_MM)), DEFAULT_SKIPPED
     )
     assert len(paths.lines.width_mm) == 4  # the one alone is too short
     gone = np.where(paths.at_mm > 2.0, 0.2, -1.0)
-    least_mm = np.full(len(paths.at_mm), USUAL_SKIPPED.least_stretch_mm)
+    least_mm = np.full(len(paths.at_mm), DEFAULT_SKIPPED.least_stretch_mm)
     kept = paths.kept(gone > 0, least_mm)
     assert kept.any()
     assert (paths.at_mm[kept] < 5.0).all()
-    grown = paths.grown(kept, gone, USUAL_SKIPPED)
+    grown = paths.grown(kept, gone, DEFAULT_SKIPPED)
     assert grown[paths.at_mm > 2.0].all()
 
 

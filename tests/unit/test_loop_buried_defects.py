@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from amrepair.cli.app import app as repair_app
 from amrepair.loop.buried_defects import buried, buried_mm3, ways
 from amrepair.loop.looks import Stop
-from amrepair.policy import USUAL_POLICY, Action, decide
+from amrepair.policy import DEFAULT_POLICY, Action, decide
 from amrepair.policy.replay import decided_again
 from amrepair.policy.table import Situation
 from amrepair.report.collect import loop_result
@@ -80,7 +80,7 @@ def test_below_the_first_layer_nothing_is_cut() -> None:
 
 
 def test_little_is_spanned_and_much_is_offered_whatever_else_is_decided() -> None:
-    least = USUAL_POLICY.buried_mm3
+    least = DEFAULT_POLICY.buried_mm3
     assert decide((), Situation(Action.GO_ON, buried_mm3=0.9 * least)).action is Action.GO_ON
     much = Situation(Action.FILL_NOW, last_pass=True, buried_mm3=1.1 * least)
     offered = decide((), much)
@@ -89,7 +89,7 @@ def test_little_is_spanned_and_much_is_offered_whatever_else_is_decided() -> Non
     assert decide((), replace(much, last_pass=False)).action is Action.FILL_NOW
     gone_on = decide((), Situation(Action.GO_ON, buried_mm3=1.1 * least))
     assert decided_again(gone_on.to_json()).action is Action.OFFER
-    other = replace(USUAL_POLICY, buried_mm3=2.0 * least)
+    other = replace(DEFAULT_POLICY, buried_mm3=2.0 * least)
     assert decided_again(gone_on.to_json(), other).action is Action.GO_ON
 
 

@@ -17,7 +17,7 @@ from manifold3d import Manifold
 
 from amrepair.frames import Transform
 from amrepair.loop import kinds
-from amrepair.loop.kind_options import USUAL_KINDS
+from amrepair.loop.kind_options import DEFAULT_KINDS
 from amrepair.loop.kinds import typed
 from amrepair.loop.shapes import last_beads
 from amrepair.regions import Label, Region
@@ -120,7 +120,7 @@ def test_a_chip_is_no_shift(wide_rad: float, from_mm: float) -> None:
     chipped = walls_of(
         lambda angle, z: np.where((np.abs(angle - 1.0) < wide_rad) & (z > from_mm), -1.2, 0.0)
     )
-    assert kinds._shifted(chipped, 0.2, USUAL_KINDS) is None
+    assert kinds._shifted(chipped, 0.2, DEFAULT_KINDS) is None
 
 
 def test_what_a_few_points_of_one_place_tell_is_no_shift() -> None:
@@ -134,7 +134,7 @@ def test_what_a_few_points_of_one_place_tell_is_no_shift() -> None:
     seen = ~upper | (np.abs(out[:, 0]) > 0.0)
     seen[chip] = True
     walls = replace(round_about, deviation_mm=deviation_mm, outward=out).part(seen, 4000)
-    assert kinds._shifted(walls, 0.2, USUAL_KINDS) is None
+    assert kinds._shifted(walls, 0.2, DEFAULT_KINDS) is None
 
 
 @pytest.mark.parametrize("seen_rad", [3.2, 1.2])
@@ -144,7 +144,7 @@ def test_a_shift_is_told_from_all_sides_or_from_one(seen_rad: float, from_mm: fl
     found = kinds._shifted(
         walls.part(np.abs(np.arctan2(*walls.outward[:, 1::-1].T)) < seen_rad, 4000),
         0.2,
-        USUAL_KINDS,
+        DEFAULT_KINDS,
     )
     assert found is not None
     assert found.type is DefectType.LAYER_SHIFT
@@ -166,7 +166,7 @@ def test_a_blob_is_no_curl(centre: tuple[float, float], radius_mm: float) -> Non
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     inside = (np.hypot(*(xy - centre).T) / radius_mm) ** 2
     blob = np.sqrt(np.maximum(1.0 - inside, 0.0))
-    assert kinds._warped(top_of(blob, xy, 0.03), 0.2, USUAL_KINDS) is None
+    assert kinds._warped(top_of(blob, xy, 0.03), 0.2, DEFAULT_KINDS) is None
 
 
 @pytest.mark.parametrize("corners", [1, 2, 4])
@@ -174,7 +174,7 @@ def test_corners_that_curl_up_are_told(corners: int) -> None:
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     angle = np.arctan2(xy[:, 1], xy[:, 0]) % (2.0 * np.pi)
     rise = np.where(angle < corners * np.pi / 2.0, 0.45 * (np.hypot(*xy.T) / 11.3) ** 2, 0.0)
-    found = kinds._warped(top_of(rise, xy, 0.03), 0.2, USUAL_KINDS)
+    found = kinds._warped(top_of(rise, xy, 0.03), 0.2, DEFAULT_KINDS)
     assert found is not None
     assert found.type is DefectType.WARP
 
@@ -186,13 +186,13 @@ def test_a_chip_is_no_curl(centre: tuple[float, float], radius_mm: float) -> Non
     # a chip off a dome was taken for a warped part, and the run ended
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     chipped = np.where(np.hypot(*(xy - centre).T) < radius_mm, -1.2, 0.0)
-    assert kinds._warped(top_of(chipped, xy, 0.03), 0.2, USUAL_KINDS) is None
+    assert kinds._warped(top_of(chipped, xy, 0.03), 0.2, DEFAULT_KINDS) is None
 
 
 def test_a_curl_is_one() -> None:
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     lifted = 0.6 * (np.hypot(*(xy / 8.0).T) / 2**0.5) ** 2
-    found = kinds._warped(top_of(lifted, xy, 0.1), 0.2, USUAL_KINDS)
+    found = kinds._warped(top_of(lifted, xy, 0.1), 0.2, DEFAULT_KINDS)
     assert found is not None
     assert found.type is DefectType.WARP
 
@@ -206,7 +206,7 @@ def told_of(  # type: ignore[no-untyped-def]
     beads = last_beads(job, stop.line)
     gone = np.arange(len(beads)) > 0.7 * len(beads)
     top = top_of(np.where(gone, -low_mm, 0.0), beads[:, :2], 0.03)
-    flow = kinds._flow(top, job, stop.line, 0.2, USUAL_KINDS)
+    flow = kinds._flow(top, job, stop.line, 0.2, DEFAULT_KINDS)
     box_mm = box_of_solid(piece)
     region = Region(
         label=Label.MISSING, type=shape, volume_mm3=piece.volume(),
@@ -215,7 +215,7 @@ def told_of(  # type: ignore[no-untyped-def]
     )  # fmt: skip
     return kinds._of_region(
         region, [piece], flow, job, stop.line, at_rim=at_rim, hangs=False, mended=mended,
-        layer_mm=0.2, options=USUAL_KINDS,
+        layer_mm=0.2, options=DEFAULT_KINDS,
     ).type  # fmt: skip
 
 
@@ -273,7 +273,7 @@ def test_a_void_that_takes_most_of_a_layer_is_no_clog(
     beads = last_beads(job, stop.line)
     middle = bench.CORNER + bench.SIZE / 2 + off_mm
     gone = np.hypot(*(beads[:, :2] - middle).T) < radius_mm
-    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2, USUAL_KINDS)
+    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2, DEFAULT_KINDS)
     assert found is None or found.type is not DefectType.CLOG
 
 
@@ -282,7 +282,7 @@ def test_what_is_short_from_a_bead_on_is_a_clog(scene, begun: float) -> None:  #
     job, stop, _, _ = scene
     beads = last_beads(job, stop.line)
     gone = np.arange(len(beads)) >= begun * len(beads)
-    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2, USUAL_KINDS)
+    found = kinds._flow(short_top(beads, gone), job, stop.line, 0.2, DEFAULT_KINDS)
     assert found is not None
     assert found.type is DefectType.CLOG
     assert found.confidence > 0.95
@@ -301,7 +301,7 @@ def test_what_is_whole_again_at_the_end_is_no_clog(
     along = np.arange(len(beads)) / len(beads)
     gone = (along >= begun) & (along < end)
     noisy = top_of(np.where(gone, -0.2, 0.0), beads[:, :2], 0.1)
-    found = kinds._flow(noisy, job, stop.line, 0.2, USUAL_KINDS)
+    found = kinds._flow(noisy, job, stop.line, 0.2, DEFAULT_KINDS)
     assert found is None or found.type is not DefectType.CLOG
 
 
@@ -341,7 +341,7 @@ def test_what_hangs_below_an_overhang_has_sagged(
     site = SimpleNamespace(template=template, printed_z_mm=printed_mm, strands=below)
     plan = SimpleNamespace(build_from_template=placed)
     piece = piece.translate((50.0, 60.0, 0.0))
-    assert kinds._hangs(piece, plan, site, USUAL_KINDS) == hangs  # type: ignore[arg-type]
+    assert kinds._hangs(piece, plan, site, DEFAULT_KINDS) == hangs  # type: ignore[arg-type]
 
 
 def rows_of_lines(layers: int) -> str:
@@ -382,8 +382,8 @@ def test_a_layer_of_sparse_lines_that_lacks_as_a_whole_is_no_clog(bare: bool) ->
         anomaly=SimpleNamespace(evidence=SimpleNamespace(surfels=SimpleNamespace(spread_mm=0.02))),
     )  # fmt: skip
     last = len(rows_of_lines(8).splitlines())
-    seen = kinds._laid(plan, job, last, 0.0, USUAL_KINDS)  # type: ignore[arg-type]
-    found = kinds._flow(seen, job, last, 0.2, USUAL_KINDS)
+    seen = kinds._laid(plan, job, last, 0.0, DEFAULT_KINDS)  # type: ignore[arg-type]
+    found = kinds._flow(seen, job, last, 0.2, DEFAULT_KINDS)
     assert found is not None
     assert found.type is DefectType.UNDER_EXTRUSION
 
@@ -400,7 +400,7 @@ def test_a_layer_that_is_low_all_along_is_no_clog(bench: ModuleType, scene) -> N
         low = np.where(late, after, before) + rng.normal(0.0, 0.15, len(points))
         up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
         seen = kinds._Surface(points, -0.2 * low, up, 0.02)
-        guess = kinds._flow(seen, job, stop.line, 0.2, USUAL_KINDS)
+        guess = kinds._flow(seen, job, stop.line, 0.2, DEFAULT_KINDS)
         return None if guess is None else guess.type
 
     assert found(0.35, 0.57) is DefectType.UNDER_EXTRUSION

@@ -36,7 +36,7 @@ from amrepair.report.collect import look_of, of_the_part, plan_result, together_
 from amrepair.report.data import ReportRule
 from amrepair.report.document import render_report
 from amrepair.report.live import COLOUR_STOPS
-from amrepair.report.options import USUAL_PAGE
+from amrepair.report.options import DEFAULT_PAGE
 from amrepair.report.text import summary_of_result
 from amrepair.scans import Scan
 from tests.report_example import HOSTILE, POCKET_MM3, example
@@ -142,7 +142,7 @@ def test_the_drawing_holds_the_data(data: ReportData, page: str) -> None:
     for shown, look in zip(values["looks"], data.looks, strict=True):
         inside = payload.near_part(look, payload.bounds(data))
         kept = encode.thinned(
-            inside.points_mm, inside.label_of_point != 0, budget=USUAL_PAGE.points_per_look
+            inside.points_mm, inside.label_of_point != 0, budget=DEFAULT_PAGE.points_per_look
         )
         points = decoded(shown["points"])
         assert np.abs(points - inside.points_mm[kept]).max() < 0.001
@@ -274,7 +274,7 @@ def test_half_a_million_points_stay_in_budget_and_it_is_said() -> None:
     page = render_report(example(500_000))
     assert len(page.encode()) < 15e6
     for look in values_of(page)["looks"]:
-        assert look["shown"] <= USUAL_PAGE.points_per_look < look["total"]
+        assert look["shown"] <= DEFAULT_PAGE.points_per_look < look["total"]
     seen = " ".join(Elements(page).visible)
     assert "use every point" in seen  # the counts themselves: the script's caption
 

@@ -16,7 +16,7 @@ from gcode.moves import Extrude
 from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job_lines import JobLines, JobPieces, gathered
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.options import USUAL_PATCH
+from gcode.slicing.options import DEFAULT_PATCH
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.surfaces.lines import heights_by_lines, near_lines
@@ -122,7 +122,7 @@ def test_beads_lie_where_the_job_laid_them():
     assert {round((y - Y0) / WIDE_MM - 0.5) for y in top[:, 1]} == set(range(10, 16))
     # below, the head has no room beside the walls for all of them: other lines serve there
     assert plan.beads_mm3 == pytest.approx(
-        USUAL_PATCH.beads.bond_ratio * missing.volume(), rel=0.03
+        DEFAULT_PATCH.beads.bond_ratio * missing.volume(), rel=0.03
     )
     assert sum(u.volume_mm3 for u in plan.unreachable) < 0.02 * missing.volume()
 
@@ -147,7 +147,7 @@ def test_a_line_that_a_scan_rounded_off_is_laid_whole():
     )
     beads = beads_of(patched(told, field, known))
     assert beads[:, 3].sum() == pytest.approx(
-        USUAL_PATCH.beads.bond_ratio * line.volume(), rel=0.04
+        DEFAULT_PATCH.beads.bond_ratio * line.volume(), rel=0.04
     )
     assert np.abs(beads[:, 1] - Y0 - 20.5 * WIDE_MM).max() < 1e-3
 
@@ -175,7 +175,7 @@ def test_on_a_slope_the_jobs_steps_come_back():
         last = int(np.round((mine[:, 1].max() - Y0) / WIDE_MM - 0.5))
         assert last == 20 + 4 * k - 1
     laid = len(lines.rim) * LONG_MM * WIDE_MM * HIGH_MM
-    assert plan.beads_mm3 == pytest.approx(USUAL_PATCH.beads.bond_ratio * laid, rel=0.03)
+    assert plan.beads_mm3 == pytest.approx(DEFAULT_PATCH.beads.bond_ratio * laid, rel=0.03)
     # as much along one line as along the next, however they lie to the columns
     line = np.round((beads[:, 1] - Y0) / WIDE_MM - 0.5).astype(int)
     top = np.abs(beads[:, 2] - TOP_MM) < 1e-6
@@ -216,7 +216,7 @@ def test_over_open_cells_a_line_gets_what_the_job_laid_there(rounded_mm: float) 
     plan = patched(missing, field, stacked(crossing(below_mm), hatch(TOP_MM).some(one)))
     assert set(beads_of(plan)[:, 2].round(3)) == {TOP_MM}
     laid = 12.0 * WIDE_MM * HIGH_MM
-    assert plan.beads_mm3 == pytest.approx(USUAL_PATCH.beads.bond_ratio * laid, rel=0.12)
+    assert plan.beads_mm3 == pytest.approx(DEFAULT_PATCH.beads.bond_ratio * laid, rel=0.12)
 
 
 @pytest.mark.parametrize("high_mm", [0.1, 0.12, 0.15, 0.2])
@@ -271,11 +271,11 @@ def test_gathering_moves_plastic_and_makes_none(shares, seed):
     assert (met <= volume + 1e-12).all()
     assert (met >= -1e-12).all()
     assert out.sum() <= volume.sum() + 1e-12
-    assert volume.sum() - out.sum() <= USUAL_PATCH.lines.nothing * own.sum() + 1e-12
+    assert volume.sum() - out.sum() <= DEFAULT_PATCH.lines.nothing * own.sum() + 1e-12
     assert (out <= np.maximum(volume, own) + 1e-12).all()
-    lot = np.array(shares) >= USUAL_PATCH.lines.little
+    lot = np.array(shares) >= DEFAULT_PATCH.lines.little
     assert (
-        out[lot] >= np.where(volume < USUAL_PATCH.lines.nothing * own, 0.0, volume)[lot] - 1e-12
+        out[lot] >= np.where(volume < DEFAULT_PATCH.lines.nothing * own, 0.0, volume)[lot] - 1e-12
     ).all()
 
 
@@ -308,7 +308,7 @@ def test_what_is_given_up_under_a_line_is_not_declared_as_reached(
     assert plan.reachable_mm3 < 0.7 * missing.volume()  # the nozzle's cone does not get down
     # reached is what plastic is laid for, and what is left is told whole
     assert plan.reachable_mm3 == pytest.approx(
-        plan.beads_mm3 / USUAL_PATCH.beads.bond_ratio, rel=0.08
+        plan.beads_mm3 / DEFAULT_PATCH.beads.bond_ratio, rel=0.08
     )
     left_mm3 = sum(piece.volume_mm3 for piece in (*plan.unreachable, *plan.unprintable))
     assert left_mm3 == pytest.approx(missing.volume() - plan.reachable_mm3, rel=0.02)

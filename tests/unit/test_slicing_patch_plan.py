@@ -11,7 +11,7 @@ import pytest
 from gcode.profiles import PrintSetup, load_setup
 from gcode.progress import silent
 from gcode.slicing.layers import LayerGrid
-from gcode.slicing.options import USUAL_PATCH
+from gcode.slicing.options import DEFAULT_PATCH
 from gcode.slicing.patch_bridges import Holds
 from gcode.slicing.patch_heights import Heights, Openings
 from gcode.slicing.patch_model import PatchModel
@@ -129,7 +129,7 @@ def test_a_way_that_fills_what_the_head_allows_is_enough(model: PatchModel) -> N
     """Others are not even tried: they take as long again."""
     heights = Heights.of(model, GRID, SETUP, openings=Openings.EACH)
     first = plan(model, heights, SETUP, silent, hems=True)
-    assert first.filled_mm3(model) >= USUAL_PATCH.due.filled_enough * model.open_mm3(
+    assert first.filled_mm3(model) >= DEFAULT_PATCH.due.filled_enough * model.open_mm3(
         GRID.layer_height_mm
     )
     asked: list[float] = []

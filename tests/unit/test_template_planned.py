@@ -11,7 +11,7 @@ from amrepair.frames import Transform
 from amrepair.loop import plan_stops
 from amrepair.loop.sites import sites
 from amrepair.repair import Site, plan_repair
-from amrepair.repair.options import USUAL_REPAIR
+from amrepair.repair.options import DEFAULT_REPAIR
 from amrepair.repair.scan_scope import within_planned
 from amrepair.scans import Scan
 from amrepair.template import PlannedSdf
@@ -166,6 +166,6 @@ def test_points_below_a_cut_template_are_not_judged_whatever_stands_beside_it() 
     z_mm = np.arange(0.1, 6.0, 0.1)
     scan = Scan(np.column_stack([np.zeros_like(z_mm), np.zeros_like(z_mm), z_mm]), 0.02, "template")
     seen_mm = within_planned(scan, site).points_mm[:, 2]
-    assert seen_mm.min() == pytest.approx(low_mm + USUAL_REPAIR.planned_edge_mm, abs=0.11)
+    assert seen_mm.min() == pytest.approx(low_mm + DEFAULT_REPAIR.planned_edge_mm, abs=0.11)
     whole = beads_of_a_block(5)
     assert within_planned(scan, Site(whole, setup, site.grid, planned=whole)) is scan

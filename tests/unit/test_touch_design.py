@@ -19,7 +19,7 @@ from amrepair.loop import Stop
 from amrepair.loop.probing import PortFeeler
 from amrepair.loop.sites import sites
 from amrepair.loop.touch_design import (
-    USUAL_TOUCHES,
+    DEFAULT_TOUCHES,
     Flats,
     ProbeOptions,
     first_places,
@@ -57,7 +57,7 @@ def site(run: PreparedRun, stop: Stop) -> Site:
 
 
 def square(side_mm: float, *, low_mm: float = 100.0) -> Flats:
-    count = round(side_mm / USUAL_TOUCHES.cell_mm)
+    count = round(side_mm / DEFAULT_TOUCHES.cell_mm)
     full = np.ones((count, count))
     return Flats(np.full(2, low_mm), 2.0 * full, 0.2 * full, full.astype(bool))
 
@@ -121,7 +121,7 @@ def test_only_tops_that_the_tip_rests_on_are_touched(run: PreparedRun, stop: Sto
     places = cells(flats)
     assert (places >= np.array(box[:2]) - 0.01).all()
     assert (places <= np.array(box[3:5]) + 0.01).all()
-    assert len(places) * USUAL_TOUCHES.cell_mm**2 == pytest.approx(600.0, rel=0.02)
+    assert len(places) * DEFAULT_TOUCHES.cell_mm**2 == pytest.approx(600.0, rel=0.02)
     assert np.allclose(flats.top_mm[flats.may], stop.z_mm)
 
 
@@ -166,7 +166,9 @@ def test_the_rim_of_a_hole_is_told_without_bias(radius_mm: float) -> None:
         touches = Touches(np.column_stack([places, z_mm]), np.full(len(places), 2.0), 0.01)
         scan = scan_of(touches, flats, tip_radius_mm=TIP_MM, reach_mm=REACH_MM, source="")
         grid = scan.points_mm[: len(scan) - len(places)]
-        ratios.append(USUAL_TOUCHES.cell_mm**2 * (grid[:, 2] < 1.9).sum() / (np.pi * radius_mm**2))
+        ratios.append(
+            DEFAULT_TOUCHES.cell_mm**2 * (grid[:, 2] < 1.9).sum() / (np.pi * radius_mm**2)
+        )
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.12)
 
 
