@@ -22,19 +22,19 @@ from amrepair.template import MeshSdf
 from tests.unit.loop_bench import solid_mesh
 
 BLOCK = m3.Manifold.cube((24, 20, 16))
-HOLE = m3.Manifold.cylinder(40, 6, 6, 48).translate((12, 10, -1))
+HOLE = m3.Manifold.cylinder(40, 8, 8, 64).translate((20, 20, -1))
 PARTS = {
     "cylinder": m3.Manifold.cylinder(20, 9, 9, 64),
     "with a hollow above": BLOCK - m3.Manifold.cube((10, 8, 6)).translate((7, 6, 7)),
-    "with a sheet across its hole": m3.Manifold.cube((24, 20, 30))
-    - (HOLE - m3.Manifold.cube((24, 20, 0.4)).translate((0, 0, 18))),
+    "with a sheet across its hole": m3.Manifold.cube((40, 40, 30))
+    - (HOLE - m3.Manifold.cube((40, 40, 0.4)).translate((0, 0, 18))),
     "block": BLOCK,
 }
 SPACING_MM2 = {"with a sheet across its hole": 0.12}
 CASES = [
     ("cylinder", 8.0, True),
     ("with a hollow above", 5.0, True),
-    ("with a sheet across its hole", 10.0, True),
+    ("with a sheet across its hole", 8.0, True),
     ("block", 2.0, False),
     ("cylinder", 3.0, False),
     ("block", 5.0, True),
