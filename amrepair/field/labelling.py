@@ -23,12 +23,12 @@ LEAST_FACING = 0.57
 
 @dataclass(frozen=True, slots=True)
 class WatchedSurface:
-    """Surface by the way it faces, and what of it was seen.
+    """Places on surface that is there or should be, and whether the scan saw them.
 
     Attributes
     ----------
-    outward, area_mm2, seen
-        Unit normals of places, the area that each stands for, and whether it was seen.
+    outward, seen, area_mm2
+        Unit normals of the places, whether each was seen, and the area that it stands for.
     """
 
     outward: Points
@@ -100,12 +100,17 @@ class OpenSides:
 
 @dataclass(frozen=True, slots=True)
 class Labelling:
-    """What is to be labelled, and by what.
+    """The search for the most probable labelling of a grid of voxels as solid or empty.
 
     Attributes
     ----------
+    scan, grid, facets
+        The scan around broken surface, the voxels, and where two of them meet.
+    watched
+        The template's surface, by which it is told how much was seen of what faces a way.
     unexplained
-        (k,) of the facets, whichever way broken surface faces.
+        (k,) how little the scan's points explain a facet, whichever way broken surface faces:
+        0 where points lie on it, 1 where none is near.
     """
 
     scan: ScannedSpace
@@ -154,8 +159,13 @@ class Labelling:
     ) -> tuple[float, Mask]:
         """Cost and labels of the cheapest labelling if broken surface faces so.
 
-        What is `known` of a labelling is surface that was seen; what places are `told` they say of
-        the space about them.
+        Parameters
+        ----------
+        told
+            (q,) open sides that are tried: the places say that space is solid behind them and
+            empty ahead.
+        known
+            (q,) open sides by the labelling before: these places count as surface that was seen.
         """
         nats = self._nats(told, np.where(told != 0, told, known))
         cut = first.dearer(nats, first.told + sides.told(told, len(first.told)))
