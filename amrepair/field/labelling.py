@@ -249,8 +249,10 @@ def _unexplained_facing(
     for axis in range(3):
         near = np.flatnonzero(~facets.on_template & (facets.axis == axis) & (share < 1.0))
         for solid, way in ((0, 1.0), (1, -1.0)):
-            places_mm = scan.broken.place_mm[way * outward[:, axis] > -LEAST_FACING]
-            both[near, solid] = _farness(facets.middle_mm[near], places_mm, width_mm)
+            explains = way * outward[:, axis] > -LEAST_FACING
+            if not explains.all():  # else it is as little explained as by all of them
+                places_mm = scan.broken.place_mm[explains]
+                both[near, solid] = _farness(facets.middle_mm[near], places_mm, width_mm)
     return both
 
 

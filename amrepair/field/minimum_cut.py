@@ -57,13 +57,12 @@ class MinimumCut:
         Where two voxels meet, (k, 2) of each the price of `one` solid alone, and of `other` alone.
     told
         (v,) of each voxel that is empty.
-    beyond
-        (2, v) of one that is solid where nothing is beyond it, on the one side and the other.
     beside
         (v, 6) voxels before and behind on each axis, −1 where there is none.
+    given
+        (v,) what flow was to fit from what is solid or, negative, to what is empty, `UNIT_NATS`.
     fits, ends
-        (v, 6) to each of them, (v,) from what is solid or, negative, to what is empty: what flow
-        still fits, `UNIT_NATS`.
+        What still does: (v, 6) to each of them, (v,) from what is solid or to what is empty.
     empty
         (v,) whether each voxel is.
     """
@@ -71,8 +70,8 @@ class MinimumCut:
     facets: Facets
     nats: Float[np.ndarray, "k 2"]
     told: Values
-    beyond: Float[np.ndarray, "2 v"]
     beside: Int[np.ndarray, "v 6"]
+    given: Numbers
     fits: Int[np.ndarray, "v 6"]
     ends: Numbers
     empty: Mask
@@ -80,30 +79,22 @@ class MinimumCut:
     @classmethod
     def of(cls, facets: Facets, nats: Float[np.ndarray, "k 2"], told: Values) -> MinimumCut:
         """By what it costs where voxels meet, and what is told of each."""
-        whole = facets.one, facets.other, facets.axis, in_units(nats), len(told)
+        whole = facets.one, facets.other, facets.axis, _in_units(nats), len(told)
         beside, fits = kernels.joined(*whole)
-        beyond = _beyond(facets, nats, len(told))
-        ends = in_units(told - beyond.sum(axis=0))
+        given = _in_units(told - _beyond(facets, nats, len(told)))
+        ends = given.copy()
         empty = kernels.flow(beside, fits, ends) == kernels.EMPTY
-        return cls(facets, nats, told, beyond, beside, fits, ends, empty)
+        return cls(facets, nats, told, beside, given, fits, ends, empty)
 
     def dearer(self, nats: Float[np.ndarray, "k 2"], told: Values) -> MinimumCut:
         """The same where no surface costs less and some costs more: what flows goes on flowing."""
         facets, count = self.facets, len(told)
-        more = in_units(nats) - in_units(self.nats)
+        more = _in_units(nats) - _in_units(self.nats)
         fits = self.fits + kernels.joined(facets.one, facets.other, facets.axis, more, count)[1]
-        beyond = _beyond(facets, nats, count)
-        ends = self._ends_with(told, beyond)
+        given = _in_units(told - _beyond(facets, nats, count))
+        ends = self.ends + given - self.given
         empty = kernels.flow(self.beside, fits, ends) == kernels.EMPTY
-        return replace(self, nats=nats, told=told, beyond=beyond, fits=fits, ends=ends, empty=empty)
-
-    def _ends_with(self, told: Values, beyond: Float[np.ndarray, "2 v"]) -> Numbers:
-        """What still fits from what is solid or to what is empty, if they are told otherwise."""
-        before, now = (
-            in_units(self.told - self.beyond.sum(axis=0)),
-            in_units(told - beyond.sum(axis=0)),
-        )
-        return self.ends + now - before
+        return replace(self, nats=nats, told=told, given=given, fits=fits, ends=ends, empty=empty)
 
     def surface_nats(self, empty: Mask) -> float:
         """What the surface of a labelling costs."""
@@ -112,18 +103,18 @@ class MinimumCut:
         return float(self.nats[one & ~other, 0].sum() + self.nats[other & ~one, 1].sum())
 
 
-def _beyond(facets: Facets, nats: Float[np.ndarray, "k 2"], count: int) -> Float[np.ndarray, "2 v"]:
-    """What a voxel costs that is solid where nothing is beyond it, on the one side and the other.
+def _beyond(facets: Facets, nats: Float[np.ndarray, "k 2"], count: int) -> Values:
+    """(v,) what a voxel costs that is solid where nothing is beyond it.
 
     What lies beyond is empty: solid ends here.
     """
-    beyond = np.zeros((2, count))
+    beyond = np.zeros(count)
     for mine, none, k in ((facets.one, facets.other, 0), (facets.other, facets.one, 1)):
         edge = (mine >= 0) & (none < 0)
-        beyond[k] = np.bincount(mine[edge], nats[edge, k], minlength=count)
+        beyond += np.bincount(mine[edge], nats[edge, k], minlength=count)
     return beyond
 
 
-def in_units(nats: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
+def _in_units(nats: Float[np.ndarray, "*shape"]) -> Int[np.ndarray, "*shape"]:
     """Whole numbers of `UNIT_NATS`."""
     return np.round(np.clip(nats, -MOST_NATS, MOST_NATS) / UNIT_NATS).astype(np.int32)

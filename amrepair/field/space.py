@@ -73,9 +73,15 @@ class Occupancy:
 
     def _near_designed(self, points_mm: Points) -> Int[np.ndarray, "n 3"]:
         """Designed voxels nearest to points: of a sheet that is thinner none holds a middle."""
-        every = np.argwhere(self.designed)
-        nearest = cKDTree(every).query((points_mm - self.low_mm) / self.voxel_mm - 0.5)[1]
+        every, tree = self._designed_voxels
+        nearest = tree.query((points_mm - self.low_mm) / self.voxel_mm - 0.5)[1]
         return np.asarray(every[nearest])
+
+    @cached_property
+    def _designed_voxels(self) -> tuple[Int[np.ndarray, "k 3"], cKDTree]:
+        """Where they are, as numbers along each axis; searched once for all that is asked."""
+        every = np.argwhere(self.designed)
+        return every, cKDTree(every)
 
     @cached_property
     def _told(self) -> Voxels:

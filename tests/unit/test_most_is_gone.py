@@ -42,27 +42,32 @@ CASES = [
 ]
 
 
+def missing_of(
+    whole: m3.Manifold, rest: m3.Manifold, *, each_mm2: float, foot: bool = True
+) -> m3.Manifold:
+    """What a bare cloud of what is left says is missing; a point stands for so much surface."""
+    mesh = solid_mesh(rest)
+    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / each_mm2), seed=0)
+    points = points + np.random.default_rng(0).normal(0.0, 0.04, points.shape)
+    if not foot:  # it lay on the scanner's table
+        points = points[points[:, 2] > 0.3]
+    scan = Scan(points, 0.04, "template")
+    template = MeshSdf.from_mesh(solid_mesh(whole))
+    return compute_deficit(
+        scan,
+        template,
+        detect(scan, template, pose="told"),
+        build_from_template=Transform.identity("build", "template"),
+    ).missing
+
+
 @pytest.mark.parametrize(("name", "ended_mm", "foot"), CASES)
 def test_what_lies_over_the_broken_face_is_gone_and_not_what_lies_under(
     name: str, ended_mm: float, foot: bool
 ) -> None:
     whole = PARTS[name]
     rest = whole.trim_by_plane((0, 0, -1), -ended_mm)
-    mesh = solid_mesh(rest)
-    points, _ = trimesh.sample.sample_surface(
-        mesh, int(mesh.area / SPACING_MM2.get(name, 0.06)), seed=0
-    )
-    points = points + np.random.default_rng(0).normal(0.0, 0.04, points.shape)
-    if not foot:  # it lay on the scanner's table
-        points = points[points[:, 2] > 0.3]
-    scan = Scan(points, 0.04, "template")
-    template = MeshSdf.from_mesh(solid_mesh(whole))
-    missing = compute_deficit(
-        scan,
-        template,
-        detect(scan, template, pose="told"),
-        build_from_template=Transform.identity("build", "template"),
-    ).missing
+    missing = missing_of(whole, rest, each_mm2=SPACING_MM2.get(name, 0.06), foot=foot)
     gone = whole - rest
     assert (missing ^ gone).volume() > 0.97 * gone.volume()
     assert (missing - whole).volume() < 0.01 * gone.volume()
@@ -73,17 +78,7 @@ def test_half_of_a_frame_leaves_an_edge_far_shorter_than_around_what_it_took() -
     # regression: its two ends, 2 × 4 mm, were thought too little to bound a void, and none was told
     whole = m3.Manifold.cube((44, 30, 4)) - m3.Manifold.cube((40, 26, 6)).translate((2, 2, -1))
     rest = whole.trim_by_plane((-1, 0, 0), -21.0)
-    mesh = solid_mesh(rest)
-    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / 0.16), seed=0)
-    points = points + np.random.default_rng(0).normal(0.0, 0.04, points.shape)
-    scan = Scan(points, 0.04, "template")
-    template = MeshSdf.from_mesh(solid_mesh(whole))
-    missing = compute_deficit(
-        scan,
-        template,
-        detect(scan, template, pose="told"),
-        build_from_template=Transform.identity("build", "template"),
-    ).missing
+    missing = missing_of(whole, rest, each_mm2=0.16)
     gone = whole - rest
     assert (missing ^ gone).volume() > 0.97 * gone.volume()
     assert (missing ^ rest).volume() < 0.01 * rest.volume()
