@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.minimum_cut import Facets, MinimumCut
-from amrepair.field.near import nearest_within
+from amrepair.field.near import has_near, nearest_within
 from amrepair.field.options import OccupancyOptions
 from amrepair.field.space import Broken, ScannedSpace, VoxelGrid, feet_on
 from amrepair.frames import unit_vectors
@@ -134,10 +134,10 @@ class Labelling:
         for _ in range(MOST_ROUNDS):
             known, before_nats, best = self._open_side(empty), nats, told
             for proposed in sides.proposals():
-                asked = np.where(known == 0, proposed, 0.0)
-                if np.count_nonzero(asked) < least:
+                if np.count_nonzero(proposed[known == 0]) < least:
                     continue
-                tried = np.where(asked != 0, asked, told)
+                # what the labelling before took for the way of the others may be as wrong
+                tried = np.where(proposed != 0, proposed, told)
                 cost, labels = self._facing(tried, known, first, sides)
                 if cost < nats:
                     nats, empty, best = cost, labels, tried
@@ -272,15 +272,18 @@ def _told(scan: ScannedSpace, grid: VoxelGrid) -> Float[np.ndarray, " v"]:
     """(v,) what is known of each voxel by itself, nats: positive solid, negative empty.
 
     As designed, a little; behind a point on the template's surface solid and before it empty, but
-    for strays; and beyond the box as designed.
+    for strays; and beyond the box as designed. Points within a voxel of broken surface tell nothing
+    of the voxels there: those are solid in part.
     """
     inside = grid.is_inside
+    deep_mm = scan.options.deep_extents * float(np.ptp(scan.template.bounds_mm, axis=0).max())
     facet = (grid.voxel_mm / scan.spacing_mm) ** 2
-    told = np.where(inside, 1.0, -1.0) * grid.voxel_mm / scan.options.deep_mm
-    f_mm, gradient = scan.template.distance_and_gradient(scan.on_mm)
+    told = np.where(inside, 1.0, -1.0) * grid.voxel_mm / deep_mm
+    on_mm = scan.on_mm[~has_near(scan.on_mm, scan.broken.place_mm, grid.voxel_mm)]
+    f_mm, gradient = scan.template.distance_and_gradient(on_mm)
     outward = unit_vectors(gradient)
     for way in (-0.5, 0.5):
-        number = grid.numbers_at(scan.on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward)
+        number = grid.numbers_at(on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward)
         number = number[number >= 0]
         number = number[inside[number] == (way < 0)]
         count = np.bincount(number, minlength=len(told))

@@ -104,7 +104,8 @@ def _as_seen(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask
     at = tuple(index[ok].T)
     cross = ndimage.generate_binary_structure(3, 1)
     for differs in (designed & ~solid, solid & ~designed):
-        groups, count = ndimage.label(differs)
+        # of a wall hardly thicker than a voxel some touch only along edges and at corners
+        groups, count = ndimage.label(differs, structure=np.ones((3, 3, 3), bool))
         # a broken place lies in what differs or in a voxel beside it
         beside = ndimage.grey_dilation(groups, footprint=cross)
         broken_mm2 = np.bincount(beside[at], minlength=count + 1) * scan.spacing_mm**2

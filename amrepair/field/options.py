@@ -41,8 +41,9 @@ class OccupancyOptions:
         Nothing is seen for certain: at most with this probability.
     hidden_cover
         Bare surface is hidden rather than gone if less was seen of what faces the same way.
-    deep_mm
-        A void is less probable by one nat for every so much of its depth.
+    deep_extents
+        A void is less probable by one nat for so much of its depth, in the template's largest
+        extents.
     hole_mm, margin_mm
         Unseen places so near to each other are one hole; space looked at around what is broken.
     bead_mm, least_seen
@@ -62,7 +63,7 @@ class OccupancyOptions:
     stray: float = 0.05
     largest_cover: float = 0.999
     hidden_cover: float = 0.5
-    deep_mm: float = 50.0
+    deep_extents: float = 2.0
     hole_mm: float = 1.0
     margin_mm: float = 1.5
     bead_mm: float = 0.4
