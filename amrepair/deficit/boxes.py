@@ -87,20 +87,25 @@ class Sought:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """A box by its (2, 3) lowest and highest corner, and how thick the defect in it is."""
+    """A box by its (2, 3) lowest and highest corner, and how thick the defect in it is.
+
+    Of a wall that broke off that is how far its end lies from its sides; of a film its height.
+    """
 
     corners_mm: Float[np.ndarray, "2 3"]
     depth_mm: float
+    is_film: bool
 
     @classmethod
-    def around(cls, places_mm: Points, margin_mm: float, depth_mm: float) -> Box:
+    def around(cls, places_mm: Points, margin_mm: float, depth_mm: float, is_film: bool) -> Box:
         """The box around places, with a margin."""
-        return cls(box_of(places_mm) + margin_mm * np.array([[-1.0], [1.0]]), depth_mm)
+        return cls(box_of(places_mm) + margin_mm * np.array([[-1.0], [1.0]]), depth_mm, is_film)
 
     def joined(self, other: Box) -> Box:
         """The box around two boxes, as finely sampled as the finer of them."""
         both_mm = np.concatenate([self.corners_mm, other.corners_mm])
-        return Box(box_of(both_mm), min(self.depth_mm, other.depth_mm))
+        depth_mm = min(self.depth_mm, other.depth_mm)
+        return Box(box_of(both_mm), depth_mm, self.is_film or other.is_film)
 
 
 def boxes_of(sought: Sought) -> list[Box]:
@@ -129,10 +134,11 @@ def boxes_of(sought: Sought) -> list[Box]:
         thin = depth[mine & film]
         if len(thin) * s.cell_mm**2 > options.least_film_mm2:
             thick = min(thick, float(np.median(thin)))  # so that samples lie in its lower half
-        found.append(Box.around(points[mine], options.margin_mm, thick))
+        is_film = 2 * len(thin) > len(known)
+        found.append(Box.around(points[mine], options.margin_mm, thick, is_film))
     if (gone := sought.gone) is not None:
         for *ends, thick in zip(gone.start_mm, gone.end_mm, gone.height_mm, strict=True):
-            found.append(Box.around(np.stack(ends), options.margin_mm, float(thick)))
+            found.append(Box.around(np.stack(ends), options.margin_mm, float(thick), is_film=True))
     return _merged(found)
 
 

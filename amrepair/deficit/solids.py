@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from amrepair.arrays import Mask, Points, Values, VoxelMask
+from amrepair.arrays import Mask, Points, Values, VoxelMask, Voxels
 from amrepair.deficit.boxes import Box, Sought, boxes_of
 from amrepair.deficit.voxels import VoxelBox, solids_from_field
 from amrepair.field.as_built import SOLID_MM
@@ -19,6 +19,8 @@ from gcode.progress import Progress
 
 # A corner of a cube of side τ lies √3 τ from the eroded template.
 GROW_FACTOR = 3**0.5
+# So that none of its cubes' corners on the template's surface is left out.
+SAMPLES_BEYOND = 2.0
 # Farther than anything that is asked for.
 FAR_MM = 10.0
 
@@ -42,7 +44,8 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
     depth_mm = min(place.depth_mm, finest_mm)
     box = VoxelBox.around(
         *place.corners_mm, thickness_mm=depth_mm,
-        across=int(np.argmax(ways)) if inside.any() else 2, options=sought.options.voxels,
+        across=int(np.argmax(ways)) if inside.any() else 2,
+        is_film=place.is_film, options=sought.options.voxels,
     )  # fmt: skip
     samples = box.samples_mm()
     f = template.distance(samples)
@@ -86,7 +89,13 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
         core[found] = sought.nearest_is_labelled(samples[found])
     else:
         core = _of_a_region(core, box, sought.told_mm(inside), s.cell_mm)
-    return _grown_back(sought, box, core & ~line, core & line, clip, f)
+    field = _grown_back(sought, box, core & ~line, core & line, clip, f)
+    options = sought.options.voxels
+    if box.step_mm.max() <= options.coarsest_mm:
+        return solids_from_field(box, field, options.crumb_mm3)
+    sure = (cautious > limit_mm / 2).reshape(box.shape)
+    beyond = _beyond_the_surface(field, (sought.sign * f > 0).reshape(box.shape), sure)
+    return _cut_to_design(sought, solids_from_field(box, beyond, options.crumb_mm3))
 
 
 def _shown(
@@ -134,7 +143,7 @@ def _limits(
 
 def _grown_back(
     sought: Sought, box: VoxelBox, core: Mask, line: Mask, clip: Values, f_mm: Values
-) -> list[manifold3d.Manifold]:
+) -> Voxels:
     """The core, grown by what the erosion took and clipped to template minus as-built.
 
     Nothing was taken of a line of the job that is gone: it is as wide as it was planned.
@@ -152,8 +161,37 @@ def _grown_back(
         field = np.where(_hangs_free(wanted, shaped < 0, field < 0), shaped, field)
     # what is enclosed in mid-air is nothing that stands: there it is as designed
     enclosed = ndimage.binary_fill_holes(field < 0) & (field >= 0)
-    field = np.where(enclosed, sought.sign * -f_mm.reshape(box.shape), field)
-    return solids_from_field(box, field, sought.options.voxels.crumb_mm3)
+    return np.where(enclosed, sought.sign * -f_mm.reshape(box.shape), field)
+
+
+def _beyond_the_surface(field: Voxels, own: VoxelMask, sure: VoxelMask) -> Voxels:
+    """Of a coarse grid: what surely differs, two samples on beyond the template's surface.
+
+    Between such samples a thin wall would be lost, and every edge rounded. The template's solid
+    cuts it instead.
+
+    Parameters
+    ----------
+    own, sure
+        On which side of the template's surface something can differ, and where it surely does.
+    """
+    if not own.any():
+        return field
+    away, nearest = ndimage.distance_transform_edt(~own, return_indices=True)
+    differs = sure & (field < 0)
+    beyond = ~own & (away <= SAMPLES_BEYOND) & differs[tuple(nearest)]
+    return np.where(beyond, -np.abs(field), field)
+
+
+def _cut_to_design(sought: Sought, pieces: list[manifold3d.Manifold]) -> list[manifold3d.Manifold]:
+    """Of pieces what lies in the template where something is missing, else what lies outside."""
+    if not pieces:
+        return pieces
+    whole = manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add)
+    design = sought.template.solid()
+    cut = whole - design if sought.is_excess else whole ^ design
+    least_mm3 = sought.options.voxels.crumb_mm3
+    return [piece for piece in cut.decompose() if piece.volume() >= least_mm3]
 
 
 def _of_a_region(

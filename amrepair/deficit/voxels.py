@@ -48,12 +48,13 @@ class VoxelBox:
         *,
         thickness_mm: float,
         across: int,
+        is_film: bool = True,
         options: VoxelOptions = DEFAULT_DEFICIT.voxels,
     ) -> VoxelBox:
         """A grid over a box, fine enough for a defect `thickness_mm` thick across one axis.
 
         Where that is too many samples it is first coarser along the defect, up to what walls need,
-        then across it, then along it again.
+        then across it, then along it again; one that is no film then across it as along it.
         """
         coarsest = options.coarsest_mm
         fine = float(np.clip(thickness_mm / options.across_ratio, options.finest_mm, coarsest))
@@ -69,6 +70,8 @@ class VoxelBox:
         least = min(thickness_mm / options.least_ratio, coarsest)
         step[across] *= min(over(), max(least / fine, 1.0))
         step[along] *= min(np.sqrt(over()), 2.0)
+        if not is_film:
+            step[across] = min(step[across] * over(), step[along][0])
         step *= over() ** (1 / 3)
         size = np.ceil(extent / step).astype(int) + 1
         return cls(low_mm, step, (int(size[0]), int(size[1]), int(size[2])))

@@ -8,7 +8,7 @@ from amrepair.deficit.boxes import Box, _merged
 
 
 def box(x_mm: float) -> Box:
-    return Box(np.array([[x_mm, 0.0, 0.0], [x_mm + 2.0, 2.0, 2.0]]), 0.2)
+    return Box(np.array([[x_mm, 0.0, 0.0], [x_mm + 2.0, 2.0, 2.0]]), 0.2, is_film=False)
 
 
 def test_boxes_that_overlap_become_one_whichever_comes_first() -> None:
