@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from gcode.slicing.layer_plan import Unfilled
+from gcode.slicing.patch_free import ROUNDING_MM
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_state import PatchState
 
@@ -125,14 +126,16 @@ def left_over(
     left = np.where(done, np.minimum(left, state.sunk_mm), left)
     kinds = _kinds(state, model)
     unreachable: list[Unfilled] = []
-    lost = list(state.lost)
+    lost: list[Unfilled] = []
     regions: list[PatchRegion] = []
     for piece in model.deficit.decompose():
         x0, y0, z0, x1, y1, z1 = (float(v) for v in piece.bounding_box())
         box: Box = (x0, y0, z0, x1, y1, z1)
-        cells = _cells_of(model, box)
-        whole_mm3 = float(wanted[cells].sum()) * cell_mm2
-        stuck_mm3 = float(left[cells].sum()) * cell_mm2
+        cells, own = model.own_columns(piece)
+        # of columns that pass through several pieces, each has its share
+        stuck = left[cells] * own / np.maximum(np.maximum(wanted[cells], own), ROUNDING_MM)
+        whole_mm3 = float(own.sum()) * cell_mm2
+        stuck_mm3 = float(stuck.sum()) * cell_mm2
         share = 1.0 - stuck_mm3 / whole_mm3 if whole_mm3 > 0 else 1.0
         share = min(max(share, 0.0), 1.0)
         volume_mm3 = float(piece.volume())
@@ -140,9 +143,7 @@ def left_over(
         if stuck_mm3 <= options.left.least_listed_mm3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
-        for cause, reason, part in _causes(
-            state, model, kinds, cells, left[cells], apart=not ended
-        ):
+        for cause, reason, part in _causes(state, model, kinds, cells, stuck, apart=not ended):
             cause_mm3 = volume_mm3 * (1.0 - share) * part
             if cause in (LeftCause.NO_BEAD, LeftCause.TOO_LONG):
                 lost.append(Unfilled(cause_mm3, box, reason))
@@ -185,12 +186,6 @@ def _columns(
             places = model.points_mm[own]
             found.append(LeftColumns(cause, model.cell_mm, places, from_mm, to_mm))
     return tuple(found)
-
-
-def _cells_of(model: PatchModel, box: Box) -> tuple[slice, slice]:
-    low = np.floor((np.array(box[:2]) - model.origin_mm) / model.cell_mm).astype(int)
-    high = np.ceil((np.array(box[3:5]) - model.origin_mm) / model.cell_mm).astype(int)
-    return slice(max(low[1], 0), high[1] + 1), slice(max(low[0], 0), high[0] + 1)
 
 
 def _causes(

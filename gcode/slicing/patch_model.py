@@ -110,6 +110,24 @@ class PatchModel:
         )
         return np.maximum(below.reshape(self.shape), 0.0)
 
+    def own_columns(self, piece: Any) -> tuple[tuple[slice, slice], Float[np.ndarray, "a b"]]:
+        """The columns around a connected piece of the deficit, and how thick it is in each.
+
+        Pieces may lie over each other, or one in the box of another.
+        """
+        box = piece.bounding_box()
+        low, high = (
+            (np.array(corner) - self.origin_mm) / self.cell_mm for corner in (box[:2], box[3:5])
+        )
+        first = np.maximum(np.floor(low).astype(int), 0)
+        last = np.minimum(np.ceil(high).astype(int) + 1, self.shape[::-1])
+        (nx, ny), (x0, y0) = (last - first).tolist(), self.origin_mm + first * self.cell_mm
+        offsets, z, up = kernels.column_crossings(*mesh_of(piece), x0, y0, self.cell_mm, nx, ny)
+        column = np.repeat(np.arange(nx * ny), np.diff(offsets))
+        thick = np.bincount(column, weights=up * z, minlength=nx * ny).reshape(ny, nx)
+        cells = (slice(first[1], last[1]), slice(first[0], last[0]))
+        return cells, np.maximum(thick, 0.0)
+
     @cached_property
     def longest_span_mm(self) -> float:
         """The longest strand over air: what the material bears, or the longest that the job spans.
