@@ -43,7 +43,9 @@ CASES = {
     ),
     "notch": (BLOCK, NOTCH),
     "groove": (BLOCK, Solid.cube((1.6, 12.0, 20.0)).translate((14.0, 6.0, 9.0))),
-    "rim, out of reach but for its top": (BLOCK, Solid.cube((0.7, 12.0, 20.0)).translate((29.3, 6, 8))),
+    "rim, reached from above alone": (
+        BLOCK, Solid.cube((0.7, 12.0, 20.0)).translate((29.3, 6.0, 8.0)),
+    ),
     "slope": (Solid.cylinder(10.0, 10.0, 3.0, 64), above(5.0)),
     "pins": (
         Solid.batch_boolean(
