@@ -124,6 +124,8 @@ def left_over(
         state.done_mm > model.top_mm - options.left.staircase_mm
     )
     left = np.where(done, np.minimum(left, state.sunk_mm), left)
+    under = model.wanted_below(model.floor_mm)
+    covered = np.where(under > options.beads.least_thick_mm, np.minimum(left, under), 0.0)
     kinds = _kinds(state, model)
     unreachable: list[Unfilled] = []
     lost: list[Unfilled] = []
@@ -131,9 +133,10 @@ def left_over(
     for piece in model.deficit.decompose():
         x0, y0, z0, x1, y1, z1 = (float(v) for v in piece.bounding_box())
         box: Box = (x0, y0, z0, x1, y1, z1)
-        cells, own = model.own_columns(piece)
+        cells, own, own_under = model.own_columns(piece)
         # of columns that pass through several pieces, each has its share
-        stuck = left[cells] * own / np.maximum(np.maximum(wanted[cells], own), ROUNDING_MM)
+        over = _share(own - own_under, (wanted - under)[cells]) * (left - covered)[cells]
+        stuck = _by_cause(kinds[cells], over, _share(own_under, under[cells]) * covered[cells])
         whole_mm3 = float(own.sum()) * cell_mm2
         stuck_mm3 = float(stuck.sum()) * cell_mm2
         share = 1.0 - stuck_mm3 / whole_mm3 if whole_mm3 > 0 else 1.0
@@ -143,13 +146,13 @@ def left_over(
         if stuck_mm3 <= options.left.least_listed_mm3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
-        for cause, reason, part in _causes(state, model, kinds, cells, stuck, apart=not ended):
+        for cause, reason, part in _causes(state, model, cells, stuck, apart=not ended):
             cause_mm3 = volume_mm3 * (1.0 - share) * part
             if cause in (LeftCause.NO_BEAD, LeftCause.TOO_LONG):
                 lost.append(Unfilled(cause_mm3, box, reason))
             else:
                 unreachable.append(Unfilled(cause_mm3, box, reason + ended))
-    columns = _columns(state, model, kinds, left)
+    columns = _columns(state, model, _by_cause(kinds, left - covered, covered))
     return LeftOver(tuple(unreachable), tuple(lost), tuple(regions), columns)
 
 
@@ -169,20 +172,37 @@ def _kinds(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
     return np.where(covered, LeftCause.COVERED, kind)
 
 
+def _by_cause(
+    kinds: Int[np.ndarray, "a b"],
+    over: Float[np.ndarray, "a b"],
+    covered: Float[np.ndarray, "a b"],
+) -> Float[np.ndarray, "k a b"]:
+    """The thickness that is left in each column, by cause: over what stands there, and below it."""
+    found = np.stack([np.where(kinds == cause, over, 0.0) for cause in LeftCause])
+    found[LeftCause.COVERED] += covered
+    return found
+
+
+def _share(
+    part: Float[np.ndarray, "a b"], of: Float[np.ndarray, "a b"]
+) -> Float[np.ndarray, "a b"]:
+    return np.clip(part, 0.0, None) / np.maximum(np.maximum(of, part), ROUNDING_MM)
+
+
 def _columns(
-    state: PatchState,
-    model: PatchModel,
-    kinds: Int[np.ndarray, "ny nx"],
-    left: Float[np.ndarray, "ny nx"],
+    state: PatchState, model: PatchModel, left: Float[np.ndarray, "k ny nx"]
 ) -> tuple[LeftColumns, ...]:
     """Where it is left, by cause."""
-    low = np.where(state.sunk_mm > 0, model.floor_mm, model.top_mm - left)
     found = []
     for cause in LeftCause:
-        own = np.flatnonzero((left > 0) & (kinds == cause))
+        own = np.flatnonzero(left[cause] > 0)
         if len(own):
+            if cause is LeftCause.COVERED:
+                low = model.bottom_mm
+            else:
+                low = np.where(state.sunk_mm > 0, model.floor_mm, model.top_mm - left[cause])
             from_mm = low.ravel()[own]
-            to_mm = from_mm + model.weight * left.ravel()[own]
+            to_mm = from_mm + model.weight * left[cause].ravel()[own]
             places = model.points_mm[own]
             found.append(LeftColumns(cause, model.cell_mm, places, from_mm, to_mm))
     return tuple(found)
@@ -191,9 +211,8 @@ def _columns(
 def _causes(
     state: PatchState,
     model: PatchModel,
-    kinds: Int[np.ndarray, "ny nx"],
     cells: tuple[slice, slice],
-    stuck: Float[np.ndarray, "a b"],
+    stuck: Float[np.ndarray, "k a b"],
     *,
     apart: bool,
 ) -> list[tuple[LeftCause, str, float]]:
@@ -203,15 +222,13 @@ def _causes(
     would be. Unless `apart`, the column with most left speaks for all.
     """
     options = model.options
-    kind, tip = kinds[cells], _tips_mm(state, model)[cells]
-    total = float(stuck.sum())
-    shares = np.bincount(kind.ravel(), stuck.ravel(), minlength=len(LeftCause)) / total
-    worst = LeftCause(kind.flat[int(np.argmax(stuck))])
+    tip = _tips_mm(state, model)[cells]
+    shares = stuck.sum(axis=(1, 2)) / float(stuck.sum())
+    worst = LeftCause(int(np.argmax(stuck.max(axis=(1, 2)))))
     told = [k for k in LeftCause if apart and shares[k] >= options.left.least_cause] or [worst]
     found = []
     for k in told:
-        at = int(np.argmax(np.where(kind == k, stuck, -1.0)))
-        iy, ix = np.unravel_index(at, stuck.shape)
+        iy, ix = np.unravel_index(int(np.argmax(stuck[k])), stuck[k].shape)
         place = (int(iy) + cells[0].start, int(ix) + cells[1].start)
         cause, reason = k, COVERED if k is LeftCause.COVERED else TOO_SMALL
         if k is LeftCause.TOO_LONG:
