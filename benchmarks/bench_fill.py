@@ -12,8 +12,11 @@ Walls of the blocks lie along the columns of that field, and end with them. `--o
 moves each case to five places where they do not: turned, narrow slots are filled less, and the cone
 keeps farther off. The judge knows tip and walls by columns of its own, and contact to half of one
 each: what it tells as 0.06 mm on the grid, and 0.10 beside it, is 0.075 in both. So contact of the
-cone is told also where it truly is. Depth is measured upright: beside a wall that its hexagon
-overlaps by 0.02 mm it is all the wall.
+cone is told also where it truly is. What the judge's head reaches is more than its own beads fill:
+it may press 0.1 mm into what stands there, where the planner presses `PRESS_MM`, and counts a voxel
+below a whole layer. So the most is told that any planner could lay, which begins beads at each
+height at which the head, pressed no deeper than ours, gets in. Depth is measured upright: beside a
+wall that its hexagon overlaps by 0.02 mm it is all the wall.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ from typing import Any
 
 import manifold3d
 import numpy as np
+from scipy import ndimage
 
 from amrepair.loop.sites import lines_of_job
 from gcode.check import find_refusals
@@ -37,12 +41,15 @@ from gcode.slicing.job import plan_part
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import slice_patch
+from gcode.slicing.reach import PRESS_MM
 from gcode.surfaces import HeightField
 from gcode.writer import write
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.bench_judge import make_cut, mesh_of
 from tests.judge import HEADS, cone_contact_mm, judge
+from tests.judge.head import HeadSlice, Reaching, least_tip, reachable
+from tests.judge.judge import FINE_MM, HANGING_MM, MOST_GAP_MM, _Scene
 
 Solid = manifold3d.Manifold
 CELL_MM = 0.1  # as a repair's field of what stands there has it
@@ -143,6 +150,29 @@ def case_of(name: str) -> Case | None:
     return Case(block, block - tool, block ^ tool)
 
 
+def most_laid(
+    rest: Any, whole: Any, box_mm: np.ndarray, head: tuple[HeadSlice, ...], nozzle_mm: float
+) -> float:
+    """Of what the head alone allows, the share that the judge's beads could fill at all."""
+    scene = _Scene.of(rest, whole, box_mm)
+    missing, low_z_mm = scene.aim & ~scene.before, float(scene.box.low_mm[2])
+    least_mm = least_tip(scene.tops_mm, scene.window, FINE_MM[0], head)
+    by = Reaching(
+        least_mm, FINE_MM[0], low_z_mm, FINE_MM[2], bead_mm=0.45, layer_mm=HANGING_MM,
+        allowed_mm=0.1,
+    )  # fmt: skip
+    reach = reachable(missing, scene.before, by, tip_layers=1.0, held=False)
+    wide = round(nozzle_mm / FINE_MM[0])
+    i, j = np.mgrid[-wide : wide + 1, -wide : wide + 1]
+    lowest_mm = ndimage.minimum_filter(least_mm - PRESS_MM, footprint=np.hypot(i, j) <= wide)
+    tip = np.ceil((lowest_mm - low_z_mm) / FINE_MM[2] - 1e-6)
+    height = missing.shape[2]
+    top = np.where(scene.before.any(2), height - scene.before[:, :, ::-1].argmax(2), 0)
+    hangs = (tip - top) * FINE_MM[2] > MOST_GAP_MM
+    from_voxel = np.where(hangs, tip - round(HANGING_MM / FINE_MM[2]), top)
+    return float((reach & (np.arange(height) >= from_voxel[:, :, None])).sum() / reach.sum())
+
+
 def lines_of(part: Any, setup: PrintSetup) -> JobLines:
     """What our own slicer lays for a part."""
     program = write(plan_part(part, setup).toolpath, setup, title="bench")
@@ -177,12 +207,13 @@ def run(
     refused = find_refusals(
         program, setup, as_built=as_built, patch=lines.bridges if lines else True
     )
-    rest, box_mm = mesh_of(case.rest), np.asarray(case.piece.bounding_box()).reshape(2, 3)
+    rest, whole = mesh_of(case.rest), mesh_of(case.whole)
+    box_mm = np.asarray(case.piece.bounding_box()).reshape(2, 3)
     head = HEADS[setup.printer.id]
     verdict = judge(
         program.text,
         rest,
-        mesh_of(case.whole),
+        whole,
         box_mm,
         head=head,
         nozzle_mm=setup.printer.nozzle_diameter_mm,
@@ -199,6 +230,7 @@ def run(
         "filled": verdict.filled_ratio,
         "filled_high": verdict.filled_high_ratio,
         "filled_open": verdict.filled_open_ratio,
+        "most_open": most_laid(rest, whole, box_mm, head, setup.printer.nozzle_diameter_mm),
         "filled_mm3": verdict.filled_mm3,
         "outside": verdict.outside_ratio,
         "in_air_mm3": verdict.in_air_mm3,
@@ -219,7 +251,8 @@ def line_of(row: dict[str, Any]) -> str:
     return (
         f"| {row['case']} | {row['printer']} | {row['missing_mm3']:.0f} | {row['reached']:.2f},"
         f" {row['open']:.2f} | {row['declared']:.2f} | {row['filled']:.3f},"
-        f" {row['filled_high']:.3f}, {row['filled_open']:.3f} | {row['outside']:.3f},"
+        f" {row['filled_high']:.3f}, {row['filled_open']:.3f} of {row['most_open']:.3f} |"
+        f" {row['outside']:.3f},"
         f" {row['in_air_mm3']:.1f} | {row['contact_mm']:.2f}, {row['cone_mm']:.3f} |"
         f" {row['refused']} | {row['seconds']:.2f} | {left} |"
     )
@@ -236,7 +269,8 @@ def page_row(row: dict[str, Any]) -> tuple[object, ...]:
 
 HEADER = (
     "| cut | printer | missing, mm³ | judge's head reaches: where something holds, at all |"
-    " declared | filled of what is held, half a layer up, a whole one; of all | outside, and in"
+    " declared | filled of what is held, half a layer up, a whole one; of all, of which"
+    " beads could fill | outside, and in"
     " the air, mm³ | contact, mm, by columns and of the cone where it is | refused | processor, s |"
     " left out, mm³, and why |\n|---|---|---|---|---|---|---|---|---|---|---|"
 )

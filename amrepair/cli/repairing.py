@@ -34,7 +34,7 @@ from gcode.cli.options import (
     program_text,
     refuse_standing,
 )
-from gcode.cli.owning import JobMaterialOption, JobPrinterOption, job_setup
+from gcode.cli.owning import ChosenSetup, JobMaterialOption, JobPrinterOption, chosen_setup
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS
 
@@ -131,7 +131,8 @@ def repair(
     _refuse_contradicting_words(scan_frame, pose, job)
     damage_at_mm = _damage_at(damage_at, scan_frame)
     text = program_text(job) if job is not None else None
-    setup, _ = job_setup(text, job or "", printer, material, process)
+    chosen = chosen_setup(text, job or "", printer, material, process)
+    setup = chosen.setup
     _ = setup.printer.head  # refused before any work
     if scan_frame == "unknown" and pose is None:
         _refuse_without_pose(job, template, setup)
@@ -169,7 +170,7 @@ def repair(
             plan = plan_repair(
                 cloud,
                 site,
-                title=f"repair of {scan.name}",
+                title=_title(scan, chosen),
                 guess=guess,
                 rng=np.random.default_rng(seed),
                 watch=watch,
@@ -188,6 +189,7 @@ def repair(
     if standing is not None:
         console.write_whole(standing, plan.deficit.as_built.write)
     result = _result_of(plan, output, field, setup, late, seed, watch.rounded_s())
+    result |= chosen.printer_json
     if turns:
         result["turns"] = [asdict(one) for one in ranked]
     if report is not None:
@@ -202,7 +204,18 @@ def repair(
                 late=late,
             )
             console.write_whole(report, lambda path: write_report(data, path))
-    _say(plan, result, output, ranked, late, older=older, as_json=as_json)
+    _say(plan, result, output, ranked, late, chosen, older=older, as_json=as_json)
+
+
+def _title(scan: Path, chosen: ChosenSetup) -> str:
+    """The first lines of the program: what it is, and by which profiles, where these have names."""
+    from gcode.profiles.own_settings import profiles_line
+
+    lines = [f"repair of {scan.name}"]
+    lines += [profiles_line(chosen.ids)] if chosen.ids is not None else []
+    if chosen.printer_from == "default":
+        lines.append("the printer is the default: none was named")
+    return "\n".join(lines)
 
 
 def _refuse_contradicting_words(scan_frame: str, pose: str | None, job: Path | None) -> None:
@@ -322,6 +335,7 @@ def _say(
     output: Path,
     ranked: tuple[Reorientation, ...],
     late: Afterwards | None,
+    chosen: ChosenSetup,
     *,
     older: bool,
     as_json: bool,
@@ -337,6 +351,7 @@ def _say(
         for line in (
             *summary_of_result(result, within_tolerance=within),
             *_taken_for_granted(result),
+            f"Printer: {chosen.printer_in_words}.",
             *(f"Left out, {line}." for line in left_out_lines(plan)),
             *_written(plan, output, within=within, older=older),
             *_suggestion(plan, ranked),

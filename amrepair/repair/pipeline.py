@@ -44,6 +44,7 @@ from gcode.check import JobBridges, check
 from gcode.errors import CheckRefusedError
 from gcode.estimate import estimate
 from gcode.moves import ModalState
+from gcode.profiles.own_settings import printer_line
 from gcode.progress import Progress, silent
 from gcode.slicing.job_lines import JobLines
 from gcode.slicing.patch import PatchPlan, slice_patch
@@ -399,6 +400,8 @@ def _checked(
     """The plan with its program, written and checked; or with the checker's refusal."""
     assert plan.patch is not None
     as_built, printer = plan.deficit.as_built, site.setup.printer
+    if interruption is None:  # a program that stands alone says for which printer
+        title = f"{title}\n{printer_line(printer)}"
     program = write(
         plan.patch.toolpath, site.setup, title=title, resume=interruption, restore=False
     )

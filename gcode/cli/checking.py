@@ -69,7 +69,8 @@ def check(
             raise InputError(f"--picture {picture}: the drawing is an .svg; name it so.")
         console.writable(picture)
     text = program_text(file)
-    setup = setup_to_judge(text, file, printer, material)
+    chosen = setup_to_judge(text, file, printer, material)
+    setup = chosen.setup
     program = Program(text, setup.printer.dialect)
     field = None if as_built is None else standing_on_bed(as_built, setup.printer)
     bars = console.Bars()
@@ -79,8 +80,7 @@ def check(
             leave_heaters=leave_heaters, progress=bars,
         )  # fmt: skip
     refusals = verdict.refusals
-    asked = printer is not None or bool(refusals)
-    other = other_printer(text, file, setup.printer) if asked else None
+    other = other_printer(text, file, setup.printer) if chosen.own is None or refusals else None
     contact = _contact_in_words(verdict, program, setup)
     drawn = picture is not None and verdict.contact is not None and verdict.moves is not None
     if picture is not None and field is not None and verdict.contact and verdict.moves:
@@ -92,7 +92,7 @@ def check(
                 "contact": contact_json(verdict.contact, contact),
                 "picture": str(picture) if drawn else None,
                 "ok": not refusals,
-                "printer": setup.printer.id,
+                **chosen.printer_json,
                 "sha256": program.sha256,
                 "other_printer": other,
                 "refusals": [refusal_json(refusal) for refusal in refusals],
@@ -108,13 +108,14 @@ def check(
             console.errors.print("The head touches nothing of what stands there.")
         for refused in by_kind(refusals):
             console.errors.print(str(refused))
+        console.errors.print(f"Judged for the {chosen.printer_in_words}.")
     else:
         tell_warnings(file, verdict.report)
         if other is not None:
             console.errors.print(f"{file}: warning: {other}.")
         console.out.print(
-            f"{file}: nothing {'else ' if verdict.report.warnings else ''}speaks against it on "
-            f"{setup.printer.name}."
+            f"{file}: nothing {'else ' if verdict.report.warnings else ''}speaks against it on the "
+            f"{chosen.printer_in_words}."
         )
     if refusals:
         raise typer.Exit(2)

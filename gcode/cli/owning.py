@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -35,6 +36,49 @@ JobMaterialOption = Annotated[
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class ChosenSetup:
+    """The profiles of a command, and who chose the printer.
+
+    Attributes
+    ----------
+    setup
+        The profiles.
+    own
+        The job's own settings, where they were taken.
+    ids
+        IDs or paths of printer, material and process; None where a job's settings made them.
+    printer_from
+        `option`, `job`, or `default` where nobody named one.
+    """
+
+    setup: PrintSetup
+    own: OwnSettings | SlicedFor | None
+    ids: tuple[str, str, str] | None
+    printer_from: str
+
+    @property
+    def printer_in_words(self) -> str:
+        """The printer, and who chose it: `Ender 3 (ender_3), as --printer names it`."""
+        who = {
+            "option": ", as --printer names it",
+            "job": f", as {self.own.job} has it" if self.own is not None else "",
+            "default": ": the default, since no --printer is given",
+        }
+        printer = self.setup.printer
+        return f"{printer.name} ({printer.id}){who[self.printer_from]}"
+
+    @property
+    def printer_json(self) -> dict[str, str]:
+        """Keys `printer`, `printer_name` and `printer_from` of a command's result."""
+        printer = self.setup.printer
+        return {
+            "printer": printer.id,
+            "printer_name": printer.name,
+            "printer_from": self.printer_from,
+        }
+
+
 def job_setup(
     text: str | None,
     name: Path | str,
@@ -42,6 +86,18 @@ def job_setup(
     material: str | None,
     process: str | None = None,
 ) -> tuple[PrintSetup, OwnSettings | SlicedFor | None]:
+    """As `chosen_setup`: the profiles for a job, and its own settings where they were taken."""
+    chosen = chosen_setup(text, name, printer, material, process)
+    return chosen.setup, chosen.own
+
+
+def chosen_setup(
+    text: str | None,
+    name: Path | str,
+    printer: str | None,
+    material: str | None,
+    process: str | None = None,
+) -> ChosenSetup:
     """The profiles for a job, with its own settings where they were taken: told in one line.
 
     Parameters
@@ -56,7 +112,7 @@ def job_setup(
     """
     from gcode.profiles import load_setup
 
-    own = _own(text, name, printer)
+    own, asked = _own(text, name, printer), printer
     if printer is None and own is None and text is not None:
         from gcode.profiles.own_settings import printer_of_words
 
@@ -65,10 +121,11 @@ def job_setup(
         console.errors.print(f"{told}; {printer} is taken.")
     ids = (printer or DEFAULT_PRINTER, material or DEFAULT_MATERIAL, process or DEFAULT_PROCESS)
     if own is None:
-        return load_setup(*ids), None
+        by = "default" if asked is None else "option"
+        return ChosenSetup(load_setup(*ids), None, ids, by)
     setup = own.setup(material, process)
     console.errors.print(f"{own.in_words(setup)}.")
-    return setup, own
+    return ChosenSetup(setup, own, own.named(material, process), "job")
 
 
 def _own(text: str | None, name: Path | str, printer: str | None) -> OwnSettings | SlicedFor | None:
@@ -80,20 +137,22 @@ def _own(text: str | None, name: Path | str, printer: str | None) -> OwnSettings
 
 def setup_to_judge(
     text: str, name: Path | str, printer: str | None, material: str | None
-) -> PrintSetup:
+) -> ChosenSetup:
     """Profiles to judge by; of a filament of unknown flow only the hotend's limit is known."""
-    setup, own = job_setup(text, name, printer, material)
-    if material is not None:
-        return setup
-    return setup if own is not None and own.flow_is_told else setup.melting_all()
+    chosen = chosen_setup(text, name, printer, material)
+    if material is not None or (chosen.own is not None and chosen.own.flow_is_told):
+        return chosen
+    return replace(chosen, setup=chosen.setup.melting_all())
 
 
 def other_printer(text: str, name: Path | str, printer: PrinterProfile) -> str | None:
-    """One sentence where a job's own settings tell of another printer; None where they do not."""
-    from gcode.profiles.own_settings import own_settings
+    """One sentence where a job itself tells of another printer; None where it does not."""
+    from gcode.profiles.own_settings import made_for_another, own_settings
 
     own = own_settings(text, str(name))
-    return own.differs_from(printer) if own is not None else None
+    return (own.differs_from(printer) if own is not None else None) or made_for_another(
+        text, str(name), printer
+    )
 
 
 @contextmanager

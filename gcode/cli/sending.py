@@ -17,7 +17,12 @@ from gcode.cli.options import (
     program_text,
     standing_on_bed,
 )
-from gcode.cli.owning import JobPrinterOption, setup_to_judge, told_if_for_another
+from gcode.cli.owning import (
+    JobPrinterOption,
+    other_printer,
+    setup_to_judge,
+    told_if_for_another,
+)
 from gcode.errors import GcodeError, InputError, ReadError
 
 if TYPE_CHECKING:
@@ -87,7 +92,8 @@ def send(
     from gcode.moves import Program
 
     text = program_text(file)
-    setup = setup_to_judge(text, file, printer, material)
+    chosen = setup_to_judge(text, file, printer, material)
+    setup = chosen.setup
     field = None if as_built is None else standing_on_bed(as_built, setup.printer)
     program = Program(text, setup.printer.dialect)
     bars = console.Bars()
@@ -99,6 +105,8 @@ def send(
                 leave_heaters=leave_heaters, progress=bars,
             )  # fmt: skip
     tell_warnings(file, checked.report)
+    if chosen.own is None and (other := other_printer(text, file, setup.printer)) is not None:
+        console.errors.print(f"{file}: warning: {other}.")
     console.errors.print(f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.")
     machine = connect(
         port,

@@ -31,6 +31,7 @@ NAMED_WITHIN = 4096
 NO_HOSTS = "Bambu Lab"
 """Whose printers are driven by their maker's own programs."""
 _SLICED_FOR = "profiles: "
+_MADE_FOR = "printer: "
 # What one would ask first, and what no slicer tells.
 _ASKED_FIRST = {
     "bed_size_mm": "bed",
@@ -84,6 +85,9 @@ class OwnSettings:
         """
         with tempfile.TemporaryDirectory(prefix="gcode-job-") as folder:
             return load_setup(*self.keep(Path(folder), material, process))
+
+    def named(self, material: str | None, process: str | None) -> None:
+        """IDs or paths of such profiles: there are none but those that `keep` writes."""
 
     def keep(
         self, folder: Path, material: str | None = None, process: str | None = None
@@ -165,12 +169,16 @@ class SlicedFor:
 
     def setup(self, material: str | None = None, process: str | None = None) -> PrintSetup:
         """These, but for what is named."""
-        return load_setup(self.ids[0], material or self.ids[1], process or self.ids[2])
+        return load_setup(*self.named(material, process))
 
     def keep(
         self, folder: Path, material: str | None = None, process: str | None = None
     ) -> tuple[str, str, str]:
         """The three paths or IDs to load; nothing is written."""
+        return self.named(material, process)
+
+    def named(self, material: str | None, process: str | None) -> tuple[str, str, str]:
+        """IDs or paths of its profiles, but for what is named."""
         return self.ids[0], material or self.ids[1], process or self.ids[2]
 
     def in_words(self, setup: PrintSetup) -> str:
@@ -195,6 +203,31 @@ def profiles_line(ids: tuple[str, str, str]) -> str:
     """What a program of ours says of its profiles; paths of files are whole."""
     whole = (str(Path(i).resolve()) if Path(i).suffix == ".toml" else i for i in ids)
     return _SLICED_FOR + ", ".join(whole)
+
+
+def printer_line(printer: PrinterProfile) -> str:
+    """What a program of ours says of its printer, for people, and where its profile is not."""
+    bed = "{:g} x {:g}".format(*printer.bed_size_mm)
+    return (
+        f"{_MADE_FOR}{_in_ascii(printer.name)} ({printer.id}), bed {bed} mm, nozzle "
+        f"{printer.nozzle_diameter_mm:g} mm"
+    )
+
+
+def made_for_another(text: str, name: str, printer: PrinterProfile) -> str | None:
+    """One sentence where a program of ours names another printer, by name alone."""
+    line = re.search(rf"^; {_MADE_FOR}(.+) \((.+)\), bed ", text[:NAMED_WITHIN], re.MULTILINE)
+    if line is None or (line[1], line[2]) == (_in_ascii(printer.name), printer.id):
+        return None
+    return (
+        f"{Path(name).name} was made for another printer than {printer.name}: for '{line[1]}' "
+        f"({line[2]}), whose profile is to be given by --printer; or make it for this one"
+    )
+
+
+def _in_ascii(text: str) -> str:
+    """As the writer of programs puts it."""
+    return text.encode("ascii", "replace").decode()
 
 
 def _sliced_for(text: str, name: str) -> SlicedFor | None:

@@ -60,10 +60,14 @@ class PatchPlan:
         The moves; empty where nothing can be laid.
     beads_mm3
         Volume of plastic in the beads.
+    spilt_mm3
+        Volume that is laid where nothing is missing, without the bond's share of the plastic
+        (`BeadOptions.bond_ratio`).
     reachable_mm3
         Volume of the deficit that the nozzle reaches.
     unreachable, unprintable
-        Pieces that the nozzle cannot reach, and pieces into which no bead fits.
+        Pieces that the nozzle cannot reach, and pieces into which no bead fits. Together with what
+        is laid, less what is spilt, they make up the deficit, but for films thinner than a bead.
     regions
         For each connected piece of the deficit, how much of it is filled.
     first_pass
@@ -76,6 +80,7 @@ class PatchPlan:
 
     toolpath: Toolpath
     beads_mm3: float
+    spilt_mm3: float
     reachable_mm3: float
     unreachable: tuple[Unfilled, ...]
     unprintable: tuple[Unfilled, ...]
@@ -171,6 +176,7 @@ def slice_patch(
     return PatchPlan(
         toolpath=Toolpath(tuple(pen.moves) if laid_mm3 > 0 else ()),
         beads_mm3=laid_mm3,
+        spilt_mm3=best.spilt_mm3(model),
         reachable_mm3=sum(r.volume_mm3 * r.reachable_ratio for r in left.regions),
         unreachable=left.unreachable,
         unprintable=left.unprintable,

@@ -73,16 +73,6 @@ class Chain:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """Centre lines in a region of columns; what is too thin for one, mm²; how thick they are."""
-
-    beads: list[Bead]
-    region: Any
-    lost_mm2: float
-    height_mm: float
-
-
 def draw(
     thick_mm: Float[np.ndarray, "ny nx"],
     free: Bool[np.ndarray, "_ry _rx"],
@@ -91,21 +81,20 @@ def draw(
     setup: PrintSetup,
     *,
     rings: int = 1,
-) -> Drawn | None:
-    """Centre lines for the columns to fill, over those where the nozzle may be; None: nowhere.
+) -> list[Bead]:
+    """Centre lines for the columns to fill, over those where the nozzle may be.
 
     Within `rings` perimeters the lines go at an angle. `free` is an answer of the model's reach.
     """
     wanted = contour(thick_mm > 0, model)
     drawn_in = offset(_free_over(wanted, free, model.reach) ^ wanted, -model.options.beads.drawn_mm)
     if drawn_in.is_empty():
-        return None
+        return []
     height_mm = float(thick_mm[thick_mm > 0].mean())
     share_mm = spacing_of(max(setup.process.line_width_mm, 1.05 * height_mm), height_mm)
     # centres may go as far as the nozzle is free; the fill reaches half a line beyond them
     region = offset(drawn_in, 0.5 * share_mm) ^ wanted
-    options = model.options.fill
-    return Drawn(*fill(region, share_mm, angle_rad, setup, options, rings=rings), height_mm)
+    return fill(region, share_mm, angle_rad, setup, model.options.fill, rings=rings)
 
 
 def begun_inside(run: Bead, model: PatchModel) -> Bead:
@@ -341,20 +330,17 @@ def fill(
     options: FillOptions,
     *,
     rings: int,
-) -> tuple[list[Bead], Any, float]:
+) -> list[Bead]:
     """Perimeters, then solid lines; along the medial axis where it is thin."""
     bore_mm = setup.printer.nozzle_diameter_mm
     beads: list[Bead] = []
-    lost_mm2 = 0.0
     for island in pieces(region):
         peeled = peel(island, share_mm, rings)
         for ring in peeled.rings:
             beads += ring_beads(ring.centre, ring.area_mm2, share_mm, Role.PERIMETER, options)
         for part in peeled.thin:
-            thin = fill_thin(part, bore_mm, options)
-            beads += thin.beads
-            lost_mm2 += thin.lost_mm2
-        fills, left_mm2 = solid_fill(
+            beads += fill_thin(part, bore_mm, options).beads
+        fills, _ = solid_fill(
             peeled.core,
             spacing_mm=share_mm,
             angle_rad=angle_rad,
@@ -363,5 +349,4 @@ def fill(
             options=options,
         )
         beads += fills
-        lost_mm2 += left_mm2
-    return beads, region, lost_mm2
+    return beads

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from gcode.slicing.layer_plan import Unfilled
+from gcode.slicing.patch_free import ROUNDING_MM
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_state import PatchState
 
@@ -123,16 +124,21 @@ def left_over(
         state.done_mm > model.top_mm - options.left.staircase_mm
     )
     left = np.where(done, np.minimum(left, state.sunk_mm), left)
+    under = model.wanted_below(model.floor_mm)
+    covered = np.where(under > options.beads.least_thick_mm, np.minimum(left, under), 0.0)
     kinds = _kinds(state, model)
     unreachable: list[Unfilled] = []
-    lost = list(state.lost)
+    lost: list[Unfilled] = []
     regions: list[PatchRegion] = []
     for piece in model.deficit.decompose():
         x0, y0, z0, x1, y1, z1 = (float(v) for v in piece.bounding_box())
         box: Box = (x0, y0, z0, x1, y1, z1)
-        cells = _cells_of(model, box)
-        whole_mm3 = float(wanted[cells].sum()) * cell_mm2
-        stuck_mm3 = float(left[cells].sum()) * cell_mm2
+        cells, own, own_under = model.own_columns(piece)
+        # of columns that pass through several pieces, each has its share
+        over = _share(own - own_under, (wanted - under)[cells]) * (left - covered)[cells]
+        stuck = _by_cause(kinds[cells], over, _share(own_under, under[cells]) * covered[cells])
+        whole_mm3 = float(own.sum()) * cell_mm2
+        stuck_mm3 = float(stuck.sum()) * cell_mm2
         share = 1.0 - stuck_mm3 / whole_mm3 if whole_mm3 > 0 else 1.0
         share = min(max(share, 0.0), 1.0)
         volume_mm3 = float(piece.volume())
@@ -140,15 +146,13 @@ def left_over(
         if stuck_mm3 <= options.left.least_listed_mm3:
             continue
         ended = NOT_CLOSED if given_up[cells].any() else ""
-        for cause, reason, part in _causes(
-            state, model, kinds, cells, left[cells], apart=not ended
-        ):
+        for cause, reason, part in _causes(state, model, cells, stuck, apart=not ended):
             cause_mm3 = volume_mm3 * (1.0 - share) * part
             if cause in (LeftCause.NO_BEAD, LeftCause.TOO_LONG):
                 lost.append(Unfilled(cause_mm3, box, reason))
             else:
                 unreachable.append(Unfilled(cause_mm3, box, reason + ended))
-    columns = _columns(state, model, kinds, left)
+    columns = _columns(state, model, _by_cause(kinds, left - covered, covered))
     return LeftOver(tuple(unreachable), tuple(lost), tuple(regions), columns)
 
 
@@ -168,37 +172,47 @@ def _kinds(state: PatchState, model: PatchModel) -> Int[np.ndarray, "ny nx"]:
     return np.where(covered, LeftCause.COVERED, kind)
 
 
+def _by_cause(
+    kinds: Int[np.ndarray, "a b"],
+    over: Float[np.ndarray, "a b"],
+    covered: Float[np.ndarray, "a b"],
+) -> Float[np.ndarray, "k a b"]:
+    """The thickness that is left in each column, by cause: over what stands there, and below it."""
+    found = np.stack([np.where(kinds == cause, over, 0.0) for cause in LeftCause])
+    found[LeftCause.COVERED] += covered
+    return found
+
+
+def _share(
+    part: Float[np.ndarray, "a b"], of: Float[np.ndarray, "a b"]
+) -> Float[np.ndarray, "a b"]:
+    return np.clip(part, 0.0, None) / np.maximum(np.maximum(of, part), ROUNDING_MM)
+
+
 def _columns(
-    state: PatchState,
-    model: PatchModel,
-    kinds: Int[np.ndarray, "ny nx"],
-    left: Float[np.ndarray, "ny nx"],
+    state: PatchState, model: PatchModel, left: Float[np.ndarray, "k ny nx"]
 ) -> tuple[LeftColumns, ...]:
     """Where it is left, by cause."""
-    low = np.where(state.sunk_mm > 0, model.floor_mm, model.top_mm - left)
     found = []
     for cause in LeftCause:
-        own = np.flatnonzero((left > 0) & (kinds == cause))
+        own = np.flatnonzero(left[cause] > 0)
         if len(own):
+            if cause is LeftCause.COVERED:
+                low = model.bottom_mm
+            else:
+                low = np.where(state.sunk_mm > 0, model.floor_mm, model.top_mm - left[cause])
             from_mm = low.ravel()[own]
-            to_mm = from_mm + model.weight * left.ravel()[own]
+            to_mm = from_mm + model.weight * left[cause].ravel()[own]
             places = model.points_mm[own]
             found.append(LeftColumns(cause, model.cell_mm, places, from_mm, to_mm))
     return tuple(found)
 
 
-def _cells_of(model: PatchModel, box: Box) -> tuple[slice, slice]:
-    low = np.floor((np.array(box[:2]) - model.origin_mm) / model.cell_mm).astype(int)
-    high = np.ceil((np.array(box[3:5]) - model.origin_mm) / model.cell_mm).astype(int)
-    return slice(max(low[1], 0), high[1] + 1), slice(max(low[0], 0), high[0] + 1)
-
-
 def _causes(
     state: PatchState,
     model: PatchModel,
-    kinds: Int[np.ndarray, "ny nx"],
     cells: tuple[slice, slice],
-    stuck: Float[np.ndarray, "a b"],
+    stuck: Float[np.ndarray, "k a b"],
     *,
     apart: bool,
 ) -> list[tuple[LeftCause, str, float]]:
@@ -208,15 +222,13 @@ def _causes(
     would be. Unless `apart`, the column with most left speaks for all.
     """
     options = model.options
-    kind, tip = kinds[cells], _tips_mm(state, model)[cells]
-    total = float(stuck.sum())
-    shares = np.bincount(kind.ravel(), stuck.ravel(), minlength=len(LeftCause)) / total
-    worst = LeftCause(kind.flat[int(np.argmax(stuck))])
+    tip = _tips_mm(state, model)[cells]
+    shares = stuck.sum(axis=(1, 2)) / float(stuck.sum())
+    worst = LeftCause(int(np.argmax(stuck.max(axis=(1, 2)))))
     told = [k for k in LeftCause if apart and shares[k] >= options.left.least_cause] or [worst]
     found = []
     for k in told:
-        at = int(np.argmax(np.where(kind == k, stuck, -1.0)))
-        iy, ix = np.unravel_index(at, stuck.shape)
+        iy, ix = np.unravel_index(int(np.argmax(stuck[k])), stuck[k].shape)
         place = (int(iy) + cells[0].start, int(ix) + cells[1].start)
         cause, reason = k, COVERED if k is LeftCause.COVERED else TOO_SMALL
         if k is LeftCause.TOO_LONG:

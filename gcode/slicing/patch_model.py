@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy import ndimage
 
 from gcode.meshes import mesh_of
@@ -101,14 +101,40 @@ class PatchModel:
         y = self.origin_mm[1] + (np.arange(ny) + 0.5) * self.cell_mm
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
-    def wanted_below(self, z_mm: float) -> Float[np.ndarray, "ny nx"]:
+    def wanted_below(self, z_mm: float | Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
         """How thick the deficit is below a height, in each column."""
-        below = np.bincount(
-            self._column,
-            weights=self._sign * np.minimum(self._z, z_mm),
-            minlength=self.shape[0] * self.shape[1],
+        return _thick_below(z_mm, self._column, self._z, self._sign, self.shape)
+
+    def own_columns(
+        self, piece: Any
+    ) -> tuple[tuple[slice, slice], Float[np.ndarray, "a b"], Float[np.ndarray, "a b"]]:
+        """The columns around a connected piece of the deficit, and how thick it is in each.
+
+        In all, and below what stands there. Pieces may lie over each other, or one in the box of
+        another.
+        """
+        box = piece.bounding_box()
+        low, high = (
+            (np.array(corner) - self.origin_mm) / self.cell_mm for corner in (box[:2], box[3:5])
         )
-        return np.maximum(below.reshape(self.shape), 0.0)
+        first = np.maximum(np.floor(low).astype(int), 0)
+        last = np.minimum(np.ceil(high).astype(int) + 1, self.shape[::-1])
+        (nx, ny), (x0, y0) = (last - first).tolist(), self.origin_mm + first * self.cell_mm
+        offsets, z, up = kernels.column_crossings(*mesh_of(piece), x0, y0, self.cell_mm, nx, ny)
+        column = np.repeat(np.arange(nx * ny), np.diff(offsets))
+        cells = (slice(first[1], last[1]), slice(first[0], last[0]))
+        own, under = (
+            _thick_below(z_mm, column, z, up.astype(np.float64), (ny, nx))
+            for z_mm in (np.inf, self.floor_mm[cells])
+        )
+        return cells, own, under
+
+    @cached_property
+    def bottom_mm(self) -> Float[np.ndarray, "ny nx"]:
+        """The lowest height at which something is missing in each column; infinite: nowhere."""
+        lowest = np.full(self.shape[0] * self.shape[1], np.inf)
+        np.minimum.at(lowest, self._column, self._z)
+        return lowest.reshape(self.shape)
 
     @cached_property
     def longest_span_mm(self) -> float:
@@ -164,3 +190,17 @@ class PatchModel:
         z_mm = self.as_built.z_mm.astype(np.float64).copy()
         np.maximum.at(z_mm, (cells[ok, 0], cells[ok, 1]), to_mm.ravel()[ok])
         return self.as_built.raised(z_mm)
+
+
+def _thick_below(
+    z_mm: float | Float[np.ndarray, "ny nx"],
+    column: Int[np.ndarray, " n"],
+    crossing_mm: Float[np.ndarray, " n"],
+    sign: Float[np.ndarray, " n"],
+    shape: tuple[int, int],
+) -> Float[np.ndarray, "ny nx"]:
+    """How thick a solid is below a height, from the crossings of columns with its surface."""
+    up_to_mm = z_mm if isinstance(z_mm, float) else z_mm.ravel()[column]
+    weights = sign * np.minimum(crossing_mm, up_to_mm)
+    below = np.bincount(column, weights=weights, minlength=shape[0] * shape[1])
+    return np.maximum(below.reshape(shape), 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,7 +10,6 @@ from jaxtyping import Bool, Float
 from gcode.profiles import PrintSetup
 from gcode.slicing.infill import SOLID_ANGLES_RAD
 from gcode.slicing.job_lines import runs_of
-from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.patch_beads import Chain, begun_inside, beside_runs, draw, weighed
 from gcode.slicing.patch_bridges import Bridges, Holds
 from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
@@ -130,15 +128,12 @@ class _Laying:
         The share of what is due that columns get.
     height_mm
         The mean thickness.
-    lost
-        What was too thin for a bead.
     """
 
     chains: list[Chain]
     laid_mm: Float[np.ndarray, "ny nx"]
     served: float
     height_mm: float
-    lost: list[Unfilled]
 
 
 def _after(
@@ -166,7 +161,6 @@ def _after(
         loose=(state.loose & ~due.bridges.over) | (due.loose & (laid > 0)),
         hung_mm=np.where(hangs, at.z_mm, state.hung_mm),
         too_long_mm=np.maximum(due.bridges.too_long_mm, state.too_long_mm),
-        lost=(*state.lost, *laying.lost),
     )
 
 
@@ -214,14 +208,15 @@ def _along_own(
     thick, bridges = np.where(due.alone, 0.0, due.thick_mm), due.bridges
     rest = np.where(bridges.over | bridges.ends, 0.0, thick)
     drawn = draw(rest, at.reach, SOLID_ANGLES_RAD[at.index % 2], model, setup)
-    runs = list(bridges.strands)
-    if drawn is not None:
-        runs += [
+    runs = [
+        *bridges.strands,
+        *(
             begun_inside(run, model)
-            for bead in eased(drawn.beads, at.reach, model.reach)
+            for bead in eased(drawn, at.reach, model.reach)
             for free in free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
             for run in (holds.held(free) if holds is not None else (free,))
-        ]
+        ),
+    ]
     if not runs:
         return None
     if holds is not None:
@@ -229,12 +224,7 @@ def _along_own(
     tips_mm = [np.full(len(run.xy_mm), at.z_mm) for run in runs]
     strips = strips_along_walls(thick, at.z_mm, model, state)
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
-    height_mm, lost = float(thick[thick > 0].mean()), []
-    if drawn is not None:
-        lost_mm3 = drawn.lost_mm2 * drawn.height_mm
-        if lost_mm3 > model.options.left.least_listed_mm3:
-            lost.append(_thin(drawn.region, at.z_mm, drawn.height_mm, lost_mm3))
-    return _Laying(chains, laid, _served(laid, due.thick_mm), height_mm, lost)
+    return _Laying(chains, laid, _served(laid, due.thick_mm), float(thick[thick > 0].mean()))
 
 
 def _along_job(
@@ -271,7 +261,7 @@ def _along_job(
     wanted = state.left_below(model, at.z_mm)
     share = float(np.clip(wanted[model.job.near].sum() / thick.sum(), options.least_of_gap, 1.0))
     chains, laid = weighed(runs, tips_mm, share * thick, strips, model, setup, job=job)
-    return _Laying(chains, laid, _served(laid, share * thick), height_mm, [])
+    return _Laying(chains, laid, _served(laid, share * thick), height_mm)
 
 
 def _served(laid_mm: Float[np.ndarray, "ny nx"], due_mm: Float[np.ndarray, "ny nx"]) -> float:
@@ -327,8 +317,7 @@ def _along_skin(
 ) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
     """Lay beads across the slope from the lowest up: the flat is then over open columns."""
     anywhere = np.ones(model.reach.shape, dtype=bool)  # among the skin's columns
-    drawn = draw(thick, anywhere, skin.across_rad, model, setup, rings=0)
-    beads = drawn.beads if drawn is not None else []
+    beads = draw(thick, anywhere, skin.across_rad, model, setup, rings=0)
     runs = [run for bead in beads for run in free_runs(bead, skin.free_between)]
     if not runs:
         return [], np.zeros(model.shape)
@@ -337,10 +326,3 @@ def _along_skin(
     chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
     upward = [c if c.z_mm[-1] >= c.z_mm[0] else c.reversed() for c in chains]
     return sorted(upward, key=lambda c: float(c.z_mm[0])), laid
-
-
-def _thin(region: Any, z_mm: float, height_mm: float, volume_mm3: float) -> Unfilled:
-    x0, y0, x1, y1 = region.bounds()
-    return Unfilled(
-        float(volume_mm3), (x0, y0, z_mm - height_mm, x1, y1, z_mm), "thinner than half a nozzle"
-    )

@@ -37,16 +37,18 @@ class PatchPasses:
         filled_mm = np.minimum(self.state.laid_mm, model.wanted_below(np.inf))
         return float(filled_mm.sum()) * model.cell_mm**2 * model.weight
 
+    def spilt_mm3(self, model: PatchModel) -> float:
+        """Volume laid where nothing is missing, or nothing more."""
+        too_much_mm = np.maximum(self.state.laid_mm - model.wanted_below(np.inf), 0.0)
+        return float(too_much_mm.sum()) * model.cell_mm**2 * model.weight
+
     def worth_mm3(self, model: PatchModel, setup: PrintSetup) -> float:
         """How good this way is: volume filled, less volume spilt, less time, all in mm³.
 
         The process profile has the weights: `repair_spill_weight`, and `repair_worth_mm3_s` for
         each second.
         """
-        wanted = model.wanted_below(np.inf)
-        cell_mm3 = model.cell_mm**2 * model.weight
-        filled = self.filled_mm3(model)
-        spilt = float(np.maximum(self.state.laid_mm - wanted, 0.0).sum()) * cell_mm3
+        filled, spilt = self.filled_mm3(model), self.spilt_mm3(model)
         length_mm = sum(
             float(np.hypot(*np.diff(chain.xy_mm, axis=0).T).sum())
             for one in self.passes

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from gcode.slicing.layer_plan import Unfilled
 from gcode.slicing.patch_model import PatchModel
 
 SAME_TIP_MM = 0.02  # passes nearer to each other lie beside, not on, each other
@@ -36,8 +35,6 @@ class PatchState:
         The height at which each column was last laid over air; −∞ where it never was.
     too_long_mm
         The length of a bridge that would be longer than the material bears; 0 elsewhere.
-    lost
-        What was too thin for a bead, pass by pass.
     """
 
     surface_mm: Float[np.ndarray, "ny nx"]
@@ -49,7 +46,6 @@ class PatchState:
     loose: Bool[np.ndarray, "ny nx"]
     hung_mm: Float[np.ndarray, "ny nx"]
     too_long_mm: Float[np.ndarray, "ny nx"]
-    lost: tuple[Unfilled, ...] = ()
 
     @classmethod
     def begun(cls, model: PatchModel) -> PatchState:

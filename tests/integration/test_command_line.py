@@ -157,6 +157,12 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     assert result["missing_mm3_after"] is None
     assert result["regions"][0]["reachable_ratio"] > 0.75
     text = out.read_text()
+    # regression: a person whose printer is another one was told nowhere that this is a Prusa's
+    assert (result["printer"], result["printer_from"]) == ("prusa_mk3s", "default")
+    head = text.splitlines()[:4]
+    assert head[:2] == ["; repair of scan.xyz", "; profiles: prusa_mk3s, pla, repair_0.20"]
+    assert head[2] == "; the printer is the default: none was named"
+    assert head[3].startswith(f"; printer: {result['printer_name']} (prusa_mk3s), bed 250 x 210 mm")
     homing = [line for line in text.splitlines() if line.startswith("G28")]
     assert homing == ["G28 X Y"]
     assert report.stat().st_size > 10_000
@@ -164,6 +170,7 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     assert call("check", out, program="gcode").returncode == 2  # Z is not homed
     checked = call("check", out, "--as-built", standing, program="gcode")
     assert checked.returncode == 0, checked.stderr
+    assert "prusa_mk3s is taken, for which it was sliced" in checked.stderr
     copy = f"file:{tmp_path / 'sent.gcode'}"
     sent = call("send", out, "--as-built", standing, "--port", copy, program="gcode")
     assert sent.returncode == 0, sent.stderr
@@ -187,6 +194,8 @@ def test_a_repair_that_is_not_needed_leaves_no_older_program(
     np.savetxt(whole, np.asarray(points)[seen] + (100.0, 80.0, 0.4), fmt="%.4f")
     out.write_text("G28\n")
     done = call("repair", whole, "--template", chipped["part.stl"], "-o", out)
+    said = " ".join(done.stdout.split())
+    assert "(prusa_mk3s): the default, since no --printer is given." in said
     assert done.returncode == 0, done.stderr
     assert not out.exists()
     said = " ".join(done.stdout.split())

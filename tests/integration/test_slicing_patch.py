@@ -19,7 +19,7 @@ from gcode.moves import Extrude, LayerChange, ModalState, Role, Toolpath
 from gcode.profiles import load_setup
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import DEFAULT_PATCH
-from gcode.slicing.patch import NOT_CLOSED, PatchPlan, slice_patch
+from gcode.slicing.patch import NOT_CLOSED, LeftCause, PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
 
@@ -480,6 +480,23 @@ def test_what_is_left_is_told_by_cause_and_adds_up() -> None:
     assert told["covered by what stands above it"] == pytest.approx(cave.volume(), rel=0.05)
     left_mm3 = sum(told.values()) + sum(one.volume_mm3 for one in plan.unprintable)
     assert left_mm3 + plan.reachable_mm3 == pytest.approx((notch + cave).volume(), rel=0.01)
+
+
+def test_what_lies_under_a_shelf_is_covered_whatever_is_missing_over_it() -> None:
+    """regression: columns that pass through both told 397 of 600 mm3 of a cave as too small."""
+    block = m3.Manifold.cube((30.0, 30.0, 12.0)).translate((60.0, 60.0, 0.0))
+    cave = m3.Manifold.cube((10.0, 30.0, 2.0)).translate((70.0, 60.0, 4.0))
+    top = m3.Manifold.cube((20.0, 20.0, 1.0)).translate((65.0, 65.0, 11.0))
+    plan, _ = plan_of(cave + top, block)
+    assert not plan.unprintable
+    told = {one.reason.split(" would")[0]: one.volume_mm3 for one in plan.unreachable}
+    assert set(told) == {"covered by what stands above it", "the nozzle"}
+    assert told["covered by what stands above it"] == pytest.approx(cave.volume(), rel=0.01)
+    ratio = {round(region.volume_mm3): region.reachable_ratio for region in plan.regions}
+    assert ratio[600] == pytest.approx(0.0, abs=0.01)
+    assert ratio[400] == pytest.approx(1.0 - told["the nozzle"] / top.volume(), abs=0.01)
+    [covered] = [left for left in plan.left if left.cause is LeftCause.COVERED]
+    assert (covered.low_mm.min(), covered.high_mm.max()) == pytest.approx((4.0, 6.0), abs=0.02)
 
 
 def test_beads_grow_a_line_s_width_a_layer_out_over_what_is_out_of_reach() -> None:

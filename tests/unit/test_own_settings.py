@@ -17,7 +17,7 @@ from gcode.profiles import load_printer
 from gcode.profiles.finding import find_presets
 from gcode.profiles.importers import import_job, import_profiles
 from gcode.profiles.importers.jobs import read_settings
-from gcode.profiles.own_settings import own_settings
+from gcode.profiles.own_settings import own_settings, printer_line
 
 MOVES = """\
 G28
@@ -294,6 +294,31 @@ def test_a_program_of_our_own_names_its_profiles(tmp_path: Path) -> None:
     assert "part.gcode was sliced for another printer than" in " ".join(other.output.split())
     gone = job.read_text().replace("voron_2_4", str(tmp_path / "gone.toml"))
     assert own_settings(gone, "part.gcode") is None
+
+
+@pytest.mark.parametrize("words", [[], ["--printer", "prusa_mk3s"]])
+def test_a_program_that_names_its_printer_by_name_alone_is_judged_with_a_warning(
+    words: list[str], tmp_path: Path
+) -> None:
+    """regression: a repair by a job's own settings was judged as the default printer, unsaid."""
+    job = tmp_path / "repair.gcode"
+    ender = load_printer("ender_3")
+    job.write_text(f"; repair of scan.ply\n; {printer_line(ender)}\n{MOVES}")
+    run = CliRunner().invoke(app, ["check", str(job), *words])
+    said = " ".join(run.output.split())
+    assert run.exit_code == 0, said
+    assert f"was made for another printer than {load_printer('prusa_mk3s').name}" in said
+    assert f"'{ender.name}' (ender_3)" in said
+    as_json = json.loads(CliRunner().invoke(app, ["check", str(job), *words, "--json"]).stdout)
+    assert (as_json["printer"], as_json["printer_name"]) == (
+        "prusa_mk3s",
+        load_printer("prusa_mk3s").name,
+    )
+    assert as_json["printer_from"] == ("option" if words else "default")
+    assert "was made for another" in as_json["other_printer"]
+    own = CliRunner().invoke(app, ["check", str(job), "--printer", "ender_3"])
+    assert "was made for another" not in own.output
+    assert f"the {ender.name} (ender_3), as --printer names it." in " ".join(own.output.split())
 
 
 def test_violations_on_another_printer_are_one_sentence(tmp_path: Path) -> None:
