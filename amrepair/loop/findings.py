@@ -236,6 +236,7 @@ def _alone(region: Region, job: Job, layer_index: int | None, layer_mm: float) -
         hit_mm=0.0,
         box_mm=_corners(region.box_mm),
         skipped=region.skipped,
+        told=region.told,
     )
 
 

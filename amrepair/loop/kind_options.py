@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from amrepair.loop.layer_shift import DEFAULT_SHIFT, ShiftOptions
+
 
 @dataclass(frozen=True, slots=True)
 class KindOptions:
@@ -13,9 +15,8 @@ class KindOptions:
     ----------
     moved_mm, moved_deg
         A calibration is good to a tenth or two; a part that moved farther has come off.
-    shift_layers, shift_share, shift_faces
-        Between two groups of layers: in layers, as a share of what the walls tell, and which share
-        of the upper walls face along it: a few points of one place are a chip's.
+    shift_layers
+        A shift of so many layers' heights is as sure as not to spoil the print.
     least_points, most_points
         Of a surface that tells something, and that are looked at.
     low_wall_mm, high_wall_mm, beside_layer_mm, top_rim_mm
@@ -32,8 +33,8 @@ class KindOptions:
         A surface that bends: range of its parabola, height of its rim; share of the deviation that
         the parabola explains.
     moved_share
-        Of how far a shift or a curl moves surface: so far it stands off, in the median.
-    shift_bands, warp_bands
+        Of how far a curl moves surface: so far it stands off, in the median.
+    warp_bands
         Of the farthest, where each band of surface begins that is looked at. A curl rises slowly,
         a blob has a rim.
     most_strain
@@ -63,13 +64,13 @@ class KindOptions:
         Mean depth: less than whole beads are missing where it is shallower.
     top_cosine, wall_cosine
         Steepness of a top, and of a wall.
+    shift
+        What it takes to tell that layers lie aside of those below, by what is seen from above.
     """
 
     moved_mm: float = 0.8
     moved_deg: float = 1.5
     shift_layers: float = 1.0
-    shift_share: float = 0.35
-    shift_faces: float = 0.05
     least_points: int = 120
     most_points: int = 6_000
     low_wall_mm: float = 0.8
@@ -85,7 +86,6 @@ class KindOptions:
     lifted_layers: float = 0.6
     warp_share: float = 0.45
     moved_share: float = 0.5
-    shift_bands: tuple[float, ...] = (0.5,)
     warp_bands: tuple[float, ...] = (0.2, 0.47, 0.73)
     most_strain: float = 0.02
     layer_share: float = 0.55
@@ -105,6 +105,7 @@ class KindOptions:
     whole_layers: float = 0.7
     top_cosine: float = 0.8
     wall_cosine: float = 0.4
+    shift: ShiftOptions = DEFAULT_SHIFT
 
 
 DEFAULT_KINDS = KindOptions()

@@ -17,10 +17,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from amrepair.arrays import Box, Mask, Matrix, PlanePoints, Values, Vector
+from amrepair.arrays import Box, Mask, PlanePoints, Values
 from amrepair.frames import Transform, turned_rad
 from amrepair.loop.findings import matching
 from amrepair.loop.kind_options import DEFAULT_KINDS, KindOptions
+from amrepair.loop.layer_shift import Walls, layer_shift
 from amrepair.loop.shapes import bead_way, last_beads, over_last_beads, spread, tall_mm
 from amrepair.loop.shapes import chain as chain_of
 from amrepair.regions import Label, Region
@@ -57,10 +58,11 @@ class _Surface:
 
 @dataclass(frozen=True, slots=True)
 class TypeGuess:
-    """A type and how sure it is."""
+    """A type, how sure it is, and what else is known of it, for people."""
 
     type: DefectType
     confidence: float
+    told: str = ""
 
 
 def typed(
@@ -92,7 +94,10 @@ def typed(
     seen = _surfaces(plan, site, options)
     whole, flow = _came_off(plan, build_from_scanner, options), None
     if whole is None and seen is not None:
-        found = (_shifted(seen[1], layer_mm, options), _warped(seen[0], layer_mm, options))
+        found = (
+            _aside(plan, job, line, seen, options),
+            _warped(seen[0], layer_mm, options),
+        )
         whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
     if whole is None and seen is not None and plan.deficit.regions and not repaired:
         flow = _flow(_laid(plan, job, line, seen[2], options), job, line, layer_mm, options)
@@ -119,8 +124,8 @@ def typed(
             options=options,
         )
         regions.append(
-            replace(region, type=kind.type, confidence=min(kind.confidence, there)
-                    if whole is None else kind.confidence)
+            replace(region, type=kind.type, told=kind.told,
+                    confidence=min(kind.confidence, there) if whole is None else kind.confidence)
         )  # fmt: skip
     if whole is not None and not any(r.volume_mm3 >= 1.0 for r in regions):
         regions.append(_everywhere(plan, site, whole))
@@ -192,6 +197,39 @@ def _laid(plan: RepairPlan, job: Job, line: int, bed_mm: float, options: KindOpt
     return seen.part(np.ones(len(over), bool), options.most_points)
 
 
+def _aside(
+    plan: RepairPlan,
+    job: Job,
+    line: int,
+    seen: tuple[_Surface, _Surface, float],
+    options: KindOptions,
+) -> TypeGuess | None:
+    """Whether layers lie aside of those below.
+
+    It is no surer than the shift is large: what it does to the print is a matter of its size.
+    """
+    (_, walls, bed_mm), scan = seen, plan.scan
+    most = options.shift.points_per_up * options.shift.most_points
+    some = np.arange(0, len(scan), max(1, -(-len(scan) // most)))
+    normals = plan.build_from_template.rotate(facing(scan, some, neighbours=options.faced_by))
+    upward = normals[:, 2] if scan.normals is not None else np.abs(normals[:, 2])
+    place_mm = plan.build_from_template.apply(scan.points_mm[some[upward > options.top_cosine]])
+    beads_mm = options.short_layers * plan.layer_height_mm
+    found = layer_shift(
+        place_mm - np.array([0.0, 0.0, bed_mm]),
+        Walls(
+            walls.place_mm, walls.deviation_mm, walls.outward[:, :2],
+            float(np.hypot(walls.noise_mm, options.shift.lateral_mm)),
+        ),
+        float(np.hypot(walls.noise_mm, beads_mm)), job, line, options.shift,
+        regions=bool(plan.deficit.regions),
+    )  # fmt: skip
+    if found is None:
+        return None
+    spoils = _sure(found.size_mm, options.shift_layers * plan.layer_height_mm)
+    return TypeGuess(DefectType.LAYER_SHIFT, min(spoils, found.confidence), found.told())
+
+
 def _came_off(
     plan: RepairPlan, build_from_scanner: Transform, options: KindOptions
 ) -> TypeGuess | None:
@@ -207,60 +245,16 @@ def _came_off(
     return TypeGuess(DefectType.DETACHED, _sure(share, 1.0)) if share > 1.0 else None
 
 
-def _shifted(walls: _Surface, layer_mm: float, options: KindOptions) -> TypeGuess | None:
-    """Walls above some height stand beside those below: two shifts tell them better than one."""
-    z, dev, out = walls.place_mm[:, 2], walls.deviation_mm, walls.outward[:, :2]
-    if len(walls) < 2 * options.least_points:
-        return None
-    total = float(((dev - dev.mean()) ** 2).sum())
-    # normal equations of the walls below each cut, from the foot up; those above are the rest
-    up = np.argsort(z)
-    design = np.column_stack([out, np.ones(len(z)), dev])[up]
-    sums = np.cumsum(design[:, :, None] * design[:, None, :], axis=0)
-    best = (0.0, 0, np.zeros(3), np.zeros(3))
-    for cut in np.linspace(0.1, 0.9, 17):
-        count = int(cut * len(z))
-        parts = [_fitted(moments) for moments in (sums[-1] - sums[count - 1], sums[count - 1])]
-        gained = total - parts[0][1] - parts[1][1]
-        if gained > best[0]:
-            best = (gained, count, parts[0][0], parts[1][0])
-    gained, count, above, below = best
-    jump_mm = float(np.linalg.norm(above[:2] - below[:2]))
-    share = gained / max(total - len(walls) * walls.noise_mm**2, 0.3 * total, 1e-12)
-    top = design[count:]
-    told, seen = top[:, :2] @ (above - below)[:2], top[:, 3] - top[:, :3] @ below
-    # walls that face along it stand out, and those that face it stand back; one side may be unseen
-    bands = options.shift_bands
-    ways = [way for way in (1.0, -1.0) if (way * told).max() > bands[0] * jump_mm]
-    faces = float((np.abs(told) > bands[0] * jump_mm).mean())
-    moved = faces > options.shift_faces and all(
-        _moved_so(way * told, way * seen, bands, options) for way in ways
-    )
-    if moved and jump_mm > options.shift_layers * layer_mm and share > options.shift_share:
-        sure = _sure(jump_mm, options.shift_layers * layer_mm)
-        return TypeGuess(
-            DefectType.LAYER_SHIFT, sure * min(1.0, share / (1.5 * options.shift_share))
-        )
-    return None
-
-
-def _moved_so(
-    told_mm: Values, seen_mm: Values, bands: tuple[float, ...], options: KindOptions
-) -> bool:
+def _moved_so(told_mm: Values, seen_mm: Values, options: KindOptions) -> bool:
     """Whether surface stands off wherever a motion of all of it has it do so, band by band.
 
     Of what broke off, or lies on it, the rest is where it was. Bands begin at shares of the
     farthest.
     """
+    bands = options.warp_bands
     band = np.digitize(told_mm / told_mm.max(), bands)
     seen = (seen_mm[band == k] / told_mm[band == k] for k in range(1, len(bands) + 1))
     return all(np.median(one) > options.moved_share for one in seen if len(one))
-
-
-def _fitted(moments: Matrix) -> tuple[Vector, float]:
-    """Least squares of the last column by the others, from all their products; what it leaves."""
-    found = np.linalg.lstsq(moments[:3, :3], moments[:3, 3], rcond=1e-9)[0]
-    return found, float(moments[3, 3] - found @ moments[:3, 3])
 
 
 def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> TypeGuess | None:
@@ -286,7 +280,7 @@ def _warped(top: _Surface, layer_mm: float, options: KindOptions) -> TypeGuess |
     up = high_mm > options.lifted_layers * layer_mm
     # layers that contract by a strain more than those below bend a part so far, and no farther
     most_mm = options.most_strain * float((half**2).sum()) / float(np.median(top.place_mm[:, 2]))
-    bent = up and lifted_mm < most_mm and _moved_so(fitted, dev, options.warp_bands, options)
+    bent = up and lifted_mm < most_mm and _moved_so(fitted, dev, options)
     if bent and lifted_mm > options.warp_layers * layer_mm and share > options.warp_share:
         sure = _sure(lifted_mm, options.warp_layers * layer_mm)
         return TypeGuess(DefectType.WARP, sure * min(1.0, share / (1.5 * options.warp_share)))
@@ -470,4 +464,5 @@ def _everywhere(plan: RepairPlan, site: Site, whole: TypeGuess) -> Region:
         depth_mm=0.0,
         box_mm=np.stack([box.min(axis=0), box.max(axis=0)]),
         confidence=whole.confidence,
+        told=whole.told,
     )

@@ -79,6 +79,8 @@ class Finding:
         Share of that object, as far as it is printed, that is missing in all its regions together.
     given_up
         Whether it lies in an object that has been given up.
+    told
+        What is known of it beyond its type, for people; the table does not look at it.
     """
 
     kind: str
@@ -98,6 +100,12 @@ class Finding:
     object: str = ""
     lost_ratio: float = 0.0
     given_up: bool = False
+    told: str = ""
+
+    @property
+    def named(self) -> str:
+        """Its type, and what is known of it beyond that."""
+        return f"{self.type} ({self.told})" if self.told else str(self.type)
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,7 +404,7 @@ class Decision:
     @property
     def told(self) -> list[str]:
         """The reasons, and what can be done, as lines for the person who is asked."""
-        own = [f"{verdict.finding.type}: {verdict.reason}" for verdict in self.own]
+        own = [f"{verdict.finding.named}: {verdict.reason}" for verdict in self.own]
         return (own or [self.reason]) + [way.told for way in self.ways]
 
     def to_json(self) -> dict[str, Any]:

@@ -68,6 +68,8 @@ class Region:
     p_value
         How many regions at least as significant a scan of a sound part is expected to show; NaN
         where no test was made.
+    told
+        What is known of it beyond its type, for people: of shifted layers how far, and which.
     """
 
     label: Label
@@ -80,6 +82,7 @@ class Region:
     confidence: float = 1.0
     skipped: bool = False
     p_value: float = float("nan")
+    told: str = ""
 
     @property
     def thickness_mm(self) -> float:

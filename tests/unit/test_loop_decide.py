@@ -126,6 +126,14 @@ def test_where_a_line_was_skipped_a_bead_has_room_however_thin_the_scan_makes_it
     assert judge(replace(THIN, skipped=True)).action is Action.FILL_NOW
 
 
+def test_who_is_asked_hears_what_is_known_of_a_finding_beyond_its_type() -> None:
+    far = "from layer 9 on it lies aside of what is below, +1.0 mm in X"
+    shifted = replace(VOID, type=DefectType.LAYER_SHIFT, told=far)
+    decision = decide([judge(shifted)], Situation(Action.STOP))
+    assert decision.told == [f"layer_shift ({far}): {decision.own[0].reason}"]
+    assert decision.to_json()["findings"][0]["told"] == far
+
+
 def test_a_decision_goes_to_the_record_with_all_that_it_rests_on() -> None:
     said = decide([judge(VOID)], Situation(Action.FILL_NOW)).to_json()
     assert said["action"] == "fill now"

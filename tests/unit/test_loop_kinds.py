@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import sys
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -101,53 +99,6 @@ def test_a_clean_surface_has_no_type(bench: ModuleType, scene) -> None:  # type:
     scan = bench.scan_of(bench.Built(0.2), 0.05, np.random.default_rng(1), part)
     plan = plan_repair(scan, site, title="", guess=placed.inverse() @ pose, strict=False)
     assert not typed(plan, job, site, stop.line, pose).deficit.regions
-
-
-def walls_of(moved: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> kinds._Surface:
-    """Walls of a round tower, 16 mm across and 12 mm high, moved by so much along their normals."""
-    rng = np.random.default_rng(2)
-    angle, z = rng.uniform(0.0, 2.0 * np.pi, 4000), rng.uniform(0.8, 11.5, 4000)
-    out = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(z))])
-    seen = moved(angle, z) + rng.normal(0.0, 0.03, len(z))
-    return kinds._Surface(np.column_stack([8.0 * out[:, :2], z]), seen, out, 0.03)
-
-
-@pytest.mark.parametrize("wide_rad", [0.4, 0.8, 1.4])
-@pytest.mark.parametrize("from_mm", [6.0, 9.5, 10.5])
-def test_a_chip_is_no_shift(wide_rad: float, from_mm: float) -> None:
-    # regression: two shifts told the walls of a chipped hook better than one, and the run ended;
-    # but the walls across from the chip stood where they should
-    chipped = walls_of(
-        lambda angle, z: np.where((np.abs(angle - 1.0) < wide_rad) & (z > from_mm), -1.2, 0.0)
-    )
-    assert kinds._shifted(chipped, 0.2, DEFAULT_KINDS) is None
-
-
-def test_what_a_few_points_of_one_place_tell_is_no_shift() -> None:
-    # regression: of a belt idler's top two walls were seen, and five points of a chip in a third
-    round_about = walls_of(lambda angle, z: np.zeros(len(z)))
-    out = np.where(np.abs(round_about.outward) > np.sqrt(0.5), np.sign(round_about.outward), 0.0)
-    upper = round_about.place_mm[:, 2] > 9.0
-    chip = np.flatnonzero(upper & (out[:, 1] < 0.0))[:5]
-    deviation_mm = round_about.deviation_mm.copy()
-    deviation_mm[chip] -= 0.9
-    seen = ~upper | (np.abs(out[:, 0]) > 0.0)
-    seen[chip] = True
-    walls = replace(round_about, deviation_mm=deviation_mm, outward=out).part(seen, 4000)
-    assert kinds._shifted(walls, 0.2, DEFAULT_KINDS) is None
-
-
-@pytest.mark.parametrize("seen_rad", [3.2, 1.2])
-@pytest.mark.parametrize("from_mm", [4.0, 9.5])
-def test_a_shift_is_told_from_all_sides_or_from_one(seen_rad: float, from_mm: float) -> None:
-    walls = walls_of(lambda angle, z: np.where(z > from_mm, 0.5 * np.cos(angle), 0.0))
-    found = kinds._shifted(
-        walls.part(np.abs(np.arctan2(*walls.outward[:, 1::-1].T)) < seen_rad, 4000),
-        0.2,
-        DEFAULT_KINDS,
-    )
-    assert found is not None
-    assert found.type is DefectType.LAYER_SHIFT
 
 
 def top_of(rise: np.ndarray, xy: np.ndarray, noise_mm: float) -> kinds._Surface:

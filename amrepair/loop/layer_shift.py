@@ -1,0 +1,483 @@
+"""Whether the layers from some one on lie aside of those below them: one model, two explanations.
+
+What is seen from above is the top of the highest bead at each place. The model has two things free:
+from which layer on all beads lie aside, by how much in X and Y; and which share of the height that
+those layers should have is there, in any mix of shares over the layer. Unmoved, it explains layers
+that are as planned, thin, or gone; moved, it explains layers that the motors have put elsewhere. Of
+one look both are fitted, and the evidence of the moved one over the best unmoved one is told patch
+by patch, as errors hang together within a patch and not beyond it: its mean over the patches has to
+stand out from its own spread (Vuong's test of models that are not nested, Econometrica 57, 1989,
+with patches for observations), by a quantile that counts how many moves were tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.special import stdtr
+
+from amrepair.arrays import Points, Values
+from amrepair.loop import layer_shift_kernels as kernels
+from gcode.reader import Job
+from gcode.surfaces.lines import heights_by_lines
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftOptions:
+    """What it takes to tell that layers lie aside.
+
+    Attributes
+    ----------
+    false_alarm
+        Probability that a look at layers which lie where they should tells a shift.
+    prior
+        Of looks, the share at which layers have shifted: what evidence is held against, for how
+        sure a shift is. What is no surer than as sure as not is looked at again.
+    tolerance_mm
+        So far aside any layer may lie, half a bead: backlash, registration, views that disagree.
+    reach_mm
+        The farthest move that is tried, in X and in Y.
+    step_mm, finest_mm
+        Moves are tried so far apart at first (a bead's width), and at last.
+    lateral_mm
+        So far aside of its place a bead's edge, or a point of the scan, is found: its standard
+        deviation in X and in Y.
+    shares
+        Of the height that the layers should have, which are there.
+    whole
+        Of the layer, what is taken to have all of its height before the look has told.
+    mixing_steps
+        So many steps of expectation and maximisation fit the mix of shares.
+    stray
+        Share of the points that lie anywhere.
+    patch_mm
+        Beyond it neither a bead's waver nor a scanner's errors hang together.
+    least_patches
+        Of a look that tells something.
+    most_points, wall_points, points_per_up
+        Points that are looked at from above, and of walls; of how many of the scan's for each that
+        faces up.
+    first_points, second_points
+        How many of them at the first moves, and where the best of those are refined; only what
+        those tell is looked at by all.
+    first_layers, refined
+        At first one in so many layers is tried as the first that lies aside; and so many of the
+        best first moves are refined.
+    cell_mm, most_cells
+        Edge of a column; it grows where a plate would have more of them.
+    layers_back, growth
+        So many of the last layers are tried one by one, then in steps that grow by so much.
+    """
+
+    false_alarm: float = 1e-3
+    prior: float = 1e-2
+    tolerance_mm: float = 0.2
+    reach_mm: float = 5.0
+    step_mm: float = 0.4
+    finest_mm: float = 0.05
+    lateral_mm: float = 0.12
+    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    whole: float = 0.6
+    mixing_steps: int = 12
+    stray: float = 0.05
+    patch_mm: float = 2.0
+    least_patches: int = 20
+    most_points: int = 6_000
+    wall_points: int = 2_000
+    points_per_up: int = 5
+    first_points: int = 400
+    second_points: int = 1_500
+    first_layers: int = 3
+    refined: int = 2
+    cell_mm: float = 0.1
+    most_cells: int = 1_500_000
+    layers_back: int = 8
+    growth: float = 1.3
+
+
+DEFAULT_SHIFT = ShiftOptions()
+"""What the loop goes by."""
+_AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) if x or y])
+_STAY = np.zeros_like(_AROUND)
+# Of upper and lower layers: both together, the upper ones, the lower ones.
+_MOVES_AROUND = np.block([[_AROUND, _AROUND], [_AROUND, _STAY], [_STAY, _AROUND]])
+
+
+@dataclass(frozen=True, slots=True)
+class LayerShift:
+    """Layers that lie aside of those below.
+
+    Attributes
+    ----------
+    layer
+        The first of them, as near as the look tells.
+    by_mm
+        In X and in Y.
+    p_value
+        Probability of such evidence where nothing lies aside.
+    confidence
+        That it is there: the prior against such evidence where it is not.
+    """
+
+    layer: int
+    by_mm: tuple[float, float]
+    p_value: float
+    confidence: float
+
+    @property
+    def size_mm(self) -> float:
+        """How far aside."""
+        return float(np.hypot(*self.by_mm))
+
+    def told(self) -> str:
+        """One sentence for people."""
+        axes = [
+            f"{size_mm:+.1f} mm in {axis}"
+            for axis, size_mm in zip("XY", self.by_mm, strict=True)
+            if abs(size_mm) >= 0.3 * self.size_mm
+        ]
+        return f"from layer {self.layer} on it lies aside of what is below, {' and '.join(axes)}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """One explanation, with the mix of shares that fits best.
+
+    `move` is that of the layers from `layer` on, in X and Y, and that of the layers below.
+    """
+
+    layer: int
+    move: Float[np.ndarray, " 4"]
+    log_density: Values
+
+    @property
+    def by_mm(self) -> Float[np.ndarray, " 2"]:
+        """By what the upper layers lie aside of the lower ones, in X and Y."""
+        return self.move[:2] - self.move[2:]
+
+    @property
+    def size_mm(self) -> float:
+        return float(np.hypot(*self.by_mm))
+
+    @property
+    def total(self) -> float:
+        return float(self.log_density.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Walls:
+    """Points of upright walls, build frame: how far out they lie, and which way is out in X and Y.
+
+    `sigma_mm` is the standard deviation of where sound walls lie.
+    """
+
+    place_mm: Points
+    deviation_mm: Values
+    outward: Float[np.ndarray, "w 2"]
+    sigma_mm: float
+
+    def some(self, every: int) -> Walls:
+        """One in so many."""
+        return Walls(
+            self.place_mm[::every], self.deviation_mm[::every], self.outward[::every], self.sigma_mm
+        )
+
+    def log_density(
+        self, cut_mm: float, moves: Float[np.ndarray, "m 4"], options: ShiftOptions
+    ) -> Float[np.ndarray, "w m"]:
+        """Of each point, by move; those above the cut lie aside by the move of the upper layers."""
+        above = (self.place_mm[:, 2] > cut_mm)[:, None]
+        told_mm = np.where(above, self.outward @ moves[:, :2].T, self.outward @ moves[:, 2:].T)
+        off = (self.deviation_mm[:, None] - told_mm) / self.sigma_mm
+        density = np.exp(-0.5 * off * off) / (self.sigma_mm * kernels.ROOT_TWO_PI)
+        other = options.stray / (2.0 * options.reach_mm)
+        return np.asarray(np.log((1.0 - options.stray) * density + other))
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """Seen heights, and how high beads reach: all of them, and those before each layer; and walls.
+
+    `place_mm` is from the rasters' corner.
+    """
+
+    place_mm: Points
+    walls: Walls
+    sigma_mm: float
+    all_mm: Float[np.ndarray, "ny nx"]
+    before_mm: dict[int, Float[np.ndarray, "ny nx"]]
+    tops_mm: Float[np.ndarray, " layers"]
+    cell_mm: float
+    options: ShiftOptions
+
+    @property
+    def other(self) -> float:
+        """Density of a height that may be anything."""
+        return 1.0 / max(float(self.all_mm.max()), 1.0)
+
+    @property
+    def aside_mm(self) -> Float[np.ndarray, "a 2"]:
+        """Three places that have the spread of `lateral_mm` in X and in Y."""
+        turn = 2.0 * np.pi * np.arange(3) / 3.0
+        return (
+            np.sqrt(2.0) * self.options.lateral_mm * np.column_stack([np.cos(turn), np.sin(turn)])
+        )
+
+    def some(self, most: int) -> _Seen:
+        """With fewer points, evenly."""
+        every = max(1, -(-len(self.place_mm) // most))
+        return replace(self, place_mm=self.place_mm[::every], walls=self.walls.some(every))
+
+    def cut_mm(self, layer: int) -> float:
+        return float(0.5 * (self.tops_mm[layer] + self.tops_mm[layer - 1]))
+
+    def evidence(
+        self, layer: int, moves: Float[np.ndarray, "m 4"], weights: Values
+    ) -> Float[np.ndarray, " m"]:
+        """Of moves, with the same mix of shares."""
+        o, cut_mm = self.options, self.cut_mm(layer)
+        from_above = kernels.evidence(
+            self.place_mm, self.aside_mm, self.all_mm, self.before_mm[layer], cut_mm,
+            self.cell_mm, np.ascontiguousarray(moves), np.array(o.shares), weights,
+            self.sigma_mm, o.stray, self.other,
+        )  # fmt: skip
+        return np.asarray(from_above + self.walls.log_density(cut_mm, moves, o).sum(axis=0))
+
+    def fitted(self, layer: int, move: Float[np.ndarray, " 4"]) -> tuple[_Fit, Values]:
+        """The best mix of shares at one move (expectation and maximisation), and what it leaves."""
+        o, cut_mm = self.options, self.cut_mm(layer)
+        by_share = kernels.densities(
+            self.place_mm, self.aside_mm, self.all_mm, self.before_mm[layer], cut_mm,
+            self.cell_mm, np.asarray(move, np.float64), np.array(o.shares), self.sigma_mm,
+        )  # fmt: skip
+        weights, other = self.mix, o.stray * self.other
+        for _ in range(o.mixing_steps):
+            of = (1.0 - o.stray) * by_share * weights
+            of /= (of.sum(axis=1) + other)[:, None]
+            weights = of.sum(axis=0) / max(float(of.sum()), 1e-9)
+        density = (1.0 - o.stray) * (by_share @ weights) + other
+        beside = self.walls.log_density(cut_mm, move[None], o)[:, 0]
+        return _Fit(layer, np.asarray(move), np.append(np.log(density), beside)), weights
+
+    @property
+    def mix(self) -> Values:
+        """Shares as they are taken to be before the look has told: most of a layer is whole."""
+        count = len(self.options.shares)
+        rest = (1.0 - self.options.whole) / (count - 1)
+        return np.array([*[rest] * (count - 1), self.options.whole])
+
+
+def layer_shift(
+    place_mm: Points,
+    walls: Walls,
+    noise_mm: float,
+    job: Job,
+    line: int,
+    options: ShiftOptions = DEFAULT_SHIFT,
+    *,
+    regions: bool = True,
+) -> LayerShift | None:
+    """Which layers lie aside of those below, if any do.
+
+    Parameters
+    ----------
+    place_mm
+        (n, 3) points that face up, build frame.
+    walls
+        Points that face aside.
+    noise_mm
+        Standard deviation of a height: of the scan, and of beads that are as they should be.
+    line
+        The job's first line that is not yet printed.
+    regions
+        Whether something was found missing or too much. If not, tops are as they should be, and
+        only walls can tell.
+    """
+    seen = _seen(place_mm, walls, noise_mm, job, line, options)
+    if seen is None:
+        return None
+    patch = _patches(seen, options.patch_mm)
+    if patch.max() + 1 < options.least_patches:
+        return None
+    if not regions and _by_walls(seen)[0] < np.log(_moves_as_far(seen, options.step_mm)):
+        return None
+    fits = _fits(seen)
+    if fits is None or fits[0].size_mm <= options.tolerance_mm:
+        return None
+    moved, rival = fits
+    gain = np.bincount(patch, moved.log_density - rival.log_density)
+    spread = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
+    one_p = float(stdtr(len(gain) - 1, -gain.mean() / spread))
+    p_value = _moves_as_far(seen, moved.size_mm) * one_p
+    if p_value > options.false_alarm:
+        return None
+    x_mm, y_mm = moved.by_mm.tolist()
+    sure = options.prior / (options.prior + p_value)
+    return LayerShift(moved.layer, (x_mm, y_mm), p_value, sure)
+
+
+def _fits(seen: _Seen) -> tuple[_Fit, _Fit] | None:
+    """The best explanations with and without a move.
+
+    None where a part of the points tells that the move explains no more than as many moves do by
+    chance.
+    """
+    some = seen.some(seen.options.second_points)
+    first = _moved(some)
+    if first.total - _unmoved(some).total < np.log(_moves_as_far(seen, first.size_mm)):
+        return None
+    moved = _best_layer(seen, _climbed(seen, first.layer, first.move, _MOVES_AROUND))
+    return _climbed(seen, moved.layer, moved.move, _MOVES_AROUND), _unmoved(seen)
+
+
+def _moves_as_far(seen: _Seen, size_mm: float) -> float:
+    """How many moves of this size are tried, from all layers on, times sizes: each has its share.
+
+    So the rate of false alarms is spread evenly over sizes, and large moves, of which there are
+    many, take nothing from small ones.
+    """
+    o = seen.options
+    ring = max(1.0, np.ceil(size_mm / o.step_mm))
+    return float(len(seen.before_mm) * (o.reach_mm / o.step_mm) * 2.0 * np.pi * ring)
+
+
+def _seen(
+    place_mm: Points, walls: Walls, noise_mm: float, job: Job, line: int, options: ShiftOptions
+) -> _Seen | None:
+    """What is seen and what the job planned, in columns; None before its second layer."""
+    beads = job.beads
+    laid = (beads.line < line) & (beads.layer >= 0)
+    if not laid.any():
+        return None
+    start, end, layer = beads.start_mm[laid], beads.end_mm[laid], beads.layer[laid]
+    half_mm = 0.5 * beads.width_mm[laid]
+    last, first = int(layer.max()), int(layer.min())
+    candidates = _layers(first, last, options)
+    if not candidates:
+        return None
+    own = layer > first
+    ends = np.concatenate([start[own, :2], end[own, :2]])
+    low, high = ends.min(axis=0) - options.reach_mm, ends.max(axis=0) + options.reach_mm
+    inside = ((place_mm[:, :2] > low) & (place_mm[:, :2] < high)).all(axis=1)
+    if not inside.any():
+        return None
+    cell_mm = max(options.cell_mm, float(np.sqrt(np.prod(high - low) / options.most_cells)))
+    nx, ny = np.ceil((high - low) / cell_mm).astype(int).tolist()
+    top = np.maximum(start[:, 2], end[:, 2])
+
+    def raster(which: np.ndarray) -> Float[np.ndarray, "ny nx"]:
+        found = heights_by_lines(
+            start[which], end[which], half_mm[which], top[which],
+            low_mm=low, cell_mm=cell_mm, shape=(ny, nx),
+        )  # fmt: skip
+        return np.maximum(found, 0.0).astype(np.float32)  # beside them lies the bed
+
+    before, done, below = {}, first, raster(layer < first)
+    for k in candidates:
+        below = np.maximum(below, raster((layer >= done) & (layer < k)))
+        before[k], done = below, k
+    every = np.maximum(below, raster(layer >= done))
+    tops_mm = np.array([one.z_mm for one in job.layers])
+    which = np.flatnonzero(inside & (place_mm[:, 2] < float(top.max()) + 1.0))
+    which = which[:: max(1, -(-len(which) // options.most_points))]
+    corner = np.array([*low, 0.0])
+    walls = walls.some(max(1, -(-len(walls.place_mm) // options.wall_points)))
+    walls = replace(walls, place_mm=walls.place_mm - corner)
+    return _Seen(
+        place_mm[which] - corner, walls, noise_mm, every, before, tops_mm, cell_mm, options
+    )
+
+
+def _layers(first: int, last: int, options: ShiftOptions) -> list[int]:
+    """Layers from which a shift may begin, ascending; the first one has nothing below."""
+    found, back = [], 0.0
+    while last - int(back) > first:
+        found.append(last - int(back))
+        back = back + 1.0 if back < options.layers_back else options.growth * back
+    return found[::-1]
+
+
+def _patches(seen: _Seen, patch_mm: float) -> Int[np.ndarray, " n"]:
+    """Of each point, walls after tops, the number of its patch."""
+    place_mm = np.concatenate([seen.place_mm, seen.walls.place_mm])
+    cell = np.floor(place_mm / patch_mm).astype(np.int64)
+    _, number = np.unique(cell, axis=0, return_inverse=True)
+    return np.asarray(number.reshape(-1))
+
+
+def _by_walls(seen: _Seen) -> tuple[float, int, Float[np.ndarray, " 4"]]:
+    """How much more the best of some small moves explains of the walls alone than none; that one.
+
+    Far moves tell nothing here: walls are held against the nearest surface.
+    """
+    o = seen.options
+    far = 0.5 * o.step_mm * np.arange(-4.0, 5.0)
+    by = np.array([(x, y) for x in far for y in far])
+    moves = np.vstack([np.zeros(4), np.hstack([by, 0.0 * by]), np.hstack([0.0 * by, -by])])
+    layers = [*seen.before_mm]
+    told = np.array([
+        seen.walls.log_density(seen.cut_mm(layer), moves, o).sum(axis=0) for layer in layers
+    ])  # fmt: skip
+    layer, best = np.unravel_index(told.argmax(), told.shape)
+    return float(told.max() - told[0, 0]), layers[int(layer)], moves[int(best)]
+
+
+def _moved(seen: _Seen) -> _Fit:
+    """The best explanation by layers that lie aside of those below.
+
+    The scan was registered to both of them: it may lie as either does, or between.
+    """
+    o = seen.options
+    far = np.arange(-o.reach_mm, o.reach_mm + 0.5 * o.step_mm, o.step_mm)
+    by = np.array([(x, y) for x in far for y in far])
+    grid = np.vstack([np.hstack([by, 0.0 * by]), np.hstack([0.0 * by, -by])])
+    few, mix, layers = seen.some(o.first_points), seen.mix, [*seen.before_mm]
+    first: list[tuple[float, Float[np.ndarray, " 4"]]] = []
+    for layer in layers[:: -o.first_layers]:
+        told = few.evidence(layer, grid, mix)
+        best_of = [int(part.argmax()) for part in told.reshape(2, -1)]
+        first += [(float(told[k]), grid[k]) for k in (best_of[0], len(by) + best_of[1])]
+    _, by_walls, walls_move = _by_walls(seen)
+    fits = [_climbed(seen, by_walls, walls_move, _MOVES_AROUND)]
+    for _, move in sorted(first, key=lambda one: -one[0])[: o.refined]:
+        told_by = [few.evidence(layer, move[None], mix)[0] for layer in layers]
+        fits.append(_climbed(seen, layers[int(np.argmax(told_by))], move, _MOVES_AROUND))
+    return max(fits, key=lambda fit: fit.total)
+
+
+def _best_layer(seen: _Seen, fit: _Fit) -> _Fit:
+    """The same move, from the layer on that explains the most."""
+    fits = [seen.fitted(layer, fit.move)[0] for layer in seen.before_mm]
+    return max(fits, key=lambda one: one.total)
+
+
+def _unmoved(seen: _Seen) -> _Fit:
+    """The best explanation by layers that lie over those below, within the tolerance."""
+    best = _best_layer(seen, _Fit(0, np.zeros(4), np.zeros(0)))
+    best = _climbed(seen, best.layer, best.move, _MOVES_AROUND[:8])
+    ring = (
+        seen.options.tolerance_mm
+        * _MOVES_AROUND[8:16]
+        / np.linalg.norm(_MOVES_AROUND[:8], axis=1)[:, None]
+    )
+    near = [seen.fitted(best.layer, best.move + move)[0] for move in ring]
+    return max([best, *near], key=lambda fit: fit.total)
+
+
+def _climbed(
+    seen: _Seen, layer: int, move: Float[np.ndarray, " 4"], ways: Float[np.ndarray, "w 4"]
+) -> _Fit:
+    """From one move to the best near it, in steps that get finer."""
+    fit, weights = seen.fitted(layer, move)
+    step_mm, total = 0.5 * seen.options.step_mm, -np.inf
+    while step_mm > 0.99 * seen.options.finest_mm:
+        around = fit.move + step_mm * np.vstack([np.zeros(4), ways])
+        told = seen.evidence(layer, around, weights)
+        if told.argmax() and told.max() > total:
+            total = float(told.max())
+            fit, weights = seen.fitted(layer, around[int(told.argmax())])
+        else:
+            step_mm *= 0.5
+    return fit
