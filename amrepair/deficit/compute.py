@@ -27,16 +27,19 @@ from amrepair.deficit.walls import with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.field.groups import area_per_point
 from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
-from amrepair.regions import AnomalyMap, Label, Region, detect
+from amrepair.regions import AnomalyMap, DefectType, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
 from amrepair.regions.planned_beads import PlannedBeads
 from amrepair.regions.regions import classify
 from amrepair.regions.skipped import skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
-from gcode.meshes import box_of_solid
+from gcode.meshes import box_of_solid, mesh_of
 from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
+
+# Of a wall's piece both sides are the template's surface, but for its ends; of a film half is.
+SURFACE_OF_WALL = 0.75
 
 
 class Standing:
@@ -309,9 +312,12 @@ def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Tra
     volume = float(piece.volume())
     area = float(piece.surface_area()) / 2
     depth = min(float(np.ptp(bounds, axis=0).min()), 2 * volume / max(area, 1e-9))
+    kind = classify(label, depth, area, bounds, template)
+    if kind is DefectType.UNDER_EXTRUSION and _has_both_sides(piece, template, depth):
+        kind = classify(label, np.inf, area, bounds, template)
     return Region(
         label,
-        classify(label, depth, area, bounds, template),
+        kind,
         volume,
         area,
         depth,
@@ -319,6 +325,19 @@ def _region(piece: manifold3d.Manifold, sought: Sought, build_from_template: Tra
         below_bead=volume < sought.options.bead_mm3,
         skipped=_is_skipped(bounds, sought.gone),
     )
+
+
+def _has_both_sides(piece: manifold3d.Manifold, template: Template, thick_mm: float) -> bool:
+    """Whether a piece goes right through a wall, as nothing does that was laid too thin.
+
+    Nearly all of its surface is the template's then; of a film one side is.
+    """
+    vertices_mm, faces = mesh_of(piece)
+    corner_mm = vertices_mm[faces]
+    across = np.cross(corner_mm[:, 1] - corner_mm[:, 0], corner_mm[:, 2] - corner_mm[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    on = np.abs(template.distance(corner_mm.mean(axis=1))) < thick_mm / 4
+    return bool(area[on].sum() > SURFACE_OF_WALL * area.sum())
 
 
 def _is_skipped(box_mm: Float[np.ndarray, "2 3"], gone: PlannedBeads | None) -> bool:

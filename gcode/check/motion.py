@@ -50,6 +50,8 @@ MOLTEN_MM = 5.0
 # slip of E, lies a factor of three: what a user's job asks beyond it is no other taste.
 GROSS = 3.0
 LEAST_BEAD_Z_MM = 0.02  # the thinnest layer that a process profile may have
+# What else a program of ours may need, which goes on from what stands on the bed.
+STANDS_THERE = ", or give what stands on the bed (--as-built): there Z is known"
 
 
 class Motion:
@@ -284,7 +286,9 @@ class Motion:
         value = (words["XYZ"[axis]] or 0.0) * self._unit
         to_mm = value if self._absolute else self._risen_mm + value
         rises = axis == 2 and to_mm > self._risen_mm and not (self._absolute and self._occupied)
-        told = ("move before homing", "XYZ"[axis], "home first")
+        # our own goes on from what stands there, where Z is true
+        first = "home first" + ("" if self._lenient or self._occupied else STANDS_THERE)
+        told = ("move before homing", "XYZ"[axis], first)
         gives_up = self._dialect in GIVES_UP_UNHOMED
         if gives_up and not self._occupied and self._lenient:
             self._warn("move before homing, unless the machine has begun by itself", *told[1:])

@@ -60,6 +60,13 @@ def test_a_good_program_passes() -> None:
     assert not checked.report.swept
 
 
+def test_a_repair_without_what_stands_there_is_told_what_it_lacks() -> None:
+    # regression: "move before homing: Z, limit home first" sent people to home onto their part
+    text = GOOD.replace("G28 W", "G1 Z2 F600\nG28 X Y")
+    (refused, *_) = find_refusals(program(text), SETUP)
+    assert "--as-built" in str(refused)
+
+
 FAULTS = {
     "x out of reach": ("G1 X90 E3 F1000", "G1 X290 E3 F1000", "X out of reach"),
     "y out of reach": ("Y50 F6000", "Y-20 F6000", "Y out of reach"),

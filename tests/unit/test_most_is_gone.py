@@ -19,9 +19,9 @@ import trimesh
 
 from amrepair.arrays import Points
 from amrepair.bench.synth_views import Rays, Shape, look, sensors_around
-from amrepair.deficit import compute_deficit
+from amrepair.deficit import Deficit, compute_deficit
 from amrepair.frames import Transform
-from amrepair.regions import detect
+from amrepair.regions import DefectType, detect
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.solids import as_manifold
@@ -60,16 +60,21 @@ def missing_of(
     whole: m3.Manifold, rest: m3.Manifold, *, each_mm2: float, foot: bool = True
 ) -> m3.Manifold:
     """What a bare cloud of what is left says is missing; a point stands for so much surface."""
-    mesh = solid_mesh(rest)
-    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / each_mm2), seed=0)
-    points = points + np.random.default_rng(0).normal(0.0, 0.04, points.shape)
+    points = points_on(rest, each_mm2=each_mm2)
     if not foot:  # it lay on the scanner's table
         points = points[points[:, 2] > 0.3]
-    return missing_by(points, whole)
+    return deficit_by(points, whole).missing
 
 
-def missing_by(points: Points, whole: m3.Manifold) -> m3.Manifold:
-    """What a bare cloud says is missing of a part."""
+def points_on(rest: m3.Manifold, *, each_mm2: float) -> Points:
+    """A bare cloud all around it, with noise."""
+    mesh = solid_mesh(rest)
+    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area / each_mm2), seed=0)
+    return np.asarray(points + np.random.default_rng(0).normal(0.0, 0.04, points.shape))
+
+
+def deficit_by(points: Points, whole: m3.Manifold) -> Deficit:
+    """What a bare cloud says differs from a part."""
     scan = Scan(points, 0.04, "template")
     template = MeshSdf.from_mesh(solid_mesh(whole))
     return compute_deficit(
@@ -77,7 +82,7 @@ def missing_by(points: Points, whole: m3.Manifold) -> m3.Manifold:
         template,
         detect(scan, template, pose="told"),
         build_from_template=Transform.identity("build", "template"),
-    ).missing
+    )
 
 
 @pytest.mark.parametrize(("name", "ended_mm", "foot"), CASES)
@@ -91,6 +96,19 @@ def test_what_lies_over_the_broken_face_is_gone_and_not_what_lies_under(
     assert (missing ^ gone).volume() > 0.97 * gone.volume()
     assert (missing - whole).volume() < 0.01 * gone.volume()
     assert (missing ^ rest).volume() < 0.01 * rest.volume()
+
+
+def test_a_wall_that_is_gone_is_no_thin_extrusion() -> None:
+    # regression: 1.2 mm is thin for its area, so that of half a vase was said "thin extrusion"
+    whole = m3.Manifold.cube((40, 40, 24)) - m3.Manifold.cube((37.6, 37.6, 24)).translate(
+        (1.2, 1.2, 1.2)
+    )
+    rest = whole.trim_by_plane((0, 0, -1), -8.0)
+    (region,) = deficit_by(points_on(rest, each_mm2=0.16), whole).regions
+    assert region.type is not DefectType.UNDER_EXTRUSION
+    low = m3.Manifold.cube((40, 40, 24)).trim_by_plane((0, 0, -1), -23.6)
+    (region,) = deficit_by(points_on(low, each_mm2=0.16), m3.Manifold.cube((40, 40, 24))).regions
+    assert region.type is DefectType.UNDER_EXTRUSION
 
 
 def test_half_of_a_frame_leaves_an_edge_far_shorter_than_around_what_it_took() -> None:
@@ -120,6 +138,6 @@ def test_broken_surface_that_faced_the_wrong_way_at_first_is_tried_the_other_way
         look(shape, rays, sensors_mm=s[None], count=1000, sigma_mm=0.04, rng=rng).points_mm
         for s in above
     ]
-    missing, gone = missing_by(np.concatenate(seen), whole), whole - rest
+    missing, gone = deficit_by(np.concatenate(seen), whole).missing, whole - rest
     assert (missing ^ gone).volume() > 0.97 * gone.volume()
     assert (missing ^ rest).volume() < 0.01 * rest.volume()
