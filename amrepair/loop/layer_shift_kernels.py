@@ -24,13 +24,18 @@ def _add(found, z, x, y, move, upper, lower, cut, cell, shares, sigma, by):
     """Add to (f,) `found` the density of a height, by which share of the upper layers is there."""
     high = _height(upper, x - move[0], y - move[1], cell)
     below = _height(lower, x - move[2], y - move[3], cell)
-    for k in range(len(shares)):
-        level = below
-        if high > max(cut, below):
-            level += shares[k] * (high - below)
-        off = (z - level) / sigma
+    by /= sigma * ROOT_TWO_PI
+    if high <= max(cut, below):  # nothing of the upper layers: all shares are one
+        off = (z - below) / sigma
         if abs(off) < SIGMAS_OF_NORMAL:
-            found[k] += by * np.exp(-0.5 * off * off) / (sigma * ROOT_TWO_PI)
+            density = by * np.exp(-0.5 * off * off)
+            for k in range(len(shares)):
+                found[k] += density
+        return
+    for k in range(len(shares)):
+        off = (z - below - shares[k] * (high - below)) / sigma
+        if abs(off) < SIGMAS_OF_NORMAL:
+            found[k] += by * np.exp(-0.5 * off * off)
 
 
 @njit(cache=True, nogil=True)
