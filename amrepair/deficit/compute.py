@@ -34,6 +34,7 @@ from amrepair.regions.regions import classify
 from amrepair.regions.skipped import skipped
 from amrepair.scans import Scan
 from amrepair.template.port import Template
+from amrepair.template.surface import triangle_areas_normals
 from gcode.meshes import box_of_solid, mesh_of
 from gcode.progress import Progress, silent
 from gcode.surfaces import HeightField
@@ -333,10 +334,8 @@ def _has_both_sides(piece: manifold3d.Manifold, template: Template, thick_mm: fl
     Nearly all of its surface is the template's then; of a film one side is.
     """
     vertices_mm, faces = mesh_of(piece)
-    corner_mm = vertices_mm[faces]
-    across = np.cross(corner_mm[:, 1] - corner_mm[:, 0], corner_mm[:, 2] - corner_mm[:, 0])
-    area = np.linalg.norm(across, axis=1)
-    on = np.abs(template.distance(corner_mm.mean(axis=1))) < thick_mm / 4
+    area, _ = triangle_areas_normals(vertices_mm, faces)
+    on = np.abs(template.distance(vertices_mm[faces].mean(axis=1))) < thick_mm / 4
     return bool(area[on].sum() > SURFACE_OF_WALL * area.sum())
 
 
