@@ -254,9 +254,9 @@ class _Seen:
         )  # fmt: skip
         weights, other = self.mix, o.stray * self.other
         for _ in range(o.mixing_steps):
-            of = (1.0 - o.stray) * by_share * weights
-            of /= (of.sum(axis=1) + other)[:, None]
-            weights = of.sum(axis=0) / max(float(of.sum()), 1e-9)
+            density = (1.0 - o.stray) * (by_share @ weights) + other
+            of_share = weights * (by_share.T @ (1.0 / density))
+            weights = of_share / max(float(of_share.sum()), 1e-9)
         density = (1.0 - o.stray) * (by_share @ weights) + other
         beside = self.walls.log_density(cut_mm, move[None], o)[:, 0]
         return _Fit(layer, np.asarray(move), np.append(np.log(density), beside)), weights
