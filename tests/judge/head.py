@@ -52,37 +52,28 @@ HEADS = {
 }
 
 
-def grown(
-    tops_mm: np.ndarray, cell_mm: float, part: HeadSlice, window: tuple[slice, slice]
-) -> np.ndarray:
-    """Highest thing under a slice of the head, by the column that the bore is over."""
-    if part.radius_to_mm > 0:
-        return under_cone(tops_mm, cell_mm, part)[window]
+def grown(tops_mm: np.ndarray, cell_mm: float, part: HeadSlice) -> np.ndarray:
+    """Highest thing under a slice of the head, by the column that the bore is over.
+
+    What is under a cone counts as much lower as the cone is higher there.
+    """
     if part.box_mm is not None:
         x0, y0, x1, y1 = (v / cell_mm for v in part.box_mm)
         size = (int(x1 - x0) | 1, int(y1 - y0) | 1)
         middle = (round((x0 + x1) / 2), round((y0 + y1) / 2))
         wide = ndimage.maximum_filter(tops_mm, size, mode="constant")
-        return ndimage.shift(wide, (-middle[0], -middle[1]), order=0, cval=0.0)[window]
-    n = int(np.ceil(part.radius_mm / cell_mm))
-    i, j = np.mgrid[-n : n + 1, -n : n + 1]
-    under = np.argwhere(np.hypot(i, j) * cell_mm < part.radius_mm) - n
-    corner = np.array([window[0].start, window[1].start])
-    shape = (window[0].stop - window[0].start, window[1].stop - window[1].start)
-    return _highest_under(tops_mm, under, corner, shape)
-
-
-def under_cone(tops_mm: np.ndarray, cell_mm: float, part: HeadSlice) -> np.ndarray:
-    """Highest thing under a cone, each as much lower as the cone is higher there."""
-    n = int(np.ceil(part.radius_to_mm / cell_mm))
+        return np.asarray(ndimage.shift(wide, (-middle[0], -middle[1]), order=0, cval=0.0))
+    radius_mm = max(part.radius_mm, part.radius_to_mm)
+    n = int(np.ceil(radius_mm / cell_mm))
     i, j = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
     apart = np.hypot(i, j) * cell_mm
-    keep = apart < part.radius_to_mm
-    rise = (part.to_mm - part.above_mm) / (part.radius_to_mm - part.radius_mm)
-    less = rise * np.maximum(apart[keep] - part.radius_mm, 0.0)
+    keep, less = apart < radius_mm, np.zeros(len(apart))
+    if part.radius_to_mm > 0:
+        rise = (part.to_mm - part.above_mm) / (part.radius_to_mm - part.radius_mm)
+        less = rise * np.maximum(apart - part.radius_mm, 0.0)
     # what no neighbour is lower than lies behind one of them, seen from anywhere
     edges = np.argwhere(tops_mm > ndimage.minimum_filter(tops_mm, 3, mode="nearest"))
-    return _spread(tops_mm, edges, np.stack([i[keep], j[keep]], axis=1), less)
+    return _spread(tops_mm, edges, np.stack([i[keep], j[keep]], axis=1), less[keep])
 
 
 @njit(cache=True)
@@ -97,24 +88,19 @@ def _spread(tops, edges, under, less):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)
-def _highest_under(tops, under, corner, shape):  # type: ignore[no-untyped-def]
-    out = np.zeros(shape)
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            for u in range(len(under)):
-                a, b = i + corner[0] + under[u, 0], j + corner[1] + under[u, 1]
-                if 0 <= a < tops.shape[0] and 0 <= b < tops.shape[1]:
-                    out[i, j] = max(out[i, j], tops[a, b])
-    return out
-
-
 def least_tip(
     tops_mm: np.ndarray, window: tuple[slice, slice], cell_mm: float, head: tuple[HeadSlice, ...]
 ) -> np.ndarray:
     """How high the tip must at least be, by column of a window."""
-    least = [grown(tops_mm, cell_mm, part, window) - part.above_mm for part in head]
-    return np.asarray(np.max(least, axis=0))
+    return tip_under(tuple(grown(tops_mm, cell_mm, part) for part in head), head, window)
+
+
+def tip_under(
+    over_mm: tuple[np.ndarray, ...], head: tuple[HeadSlice, ...], window: tuple[slice, slice]
+) -> np.ndarray:
+    """The same, of what is highest under each slice of the head."""
+    pairs = zip(over_mm, head, strict=True)
+    return np.asarray(np.max([over[window] - part.above_mm for over, part in pairs], axis=0))
 
 
 @dataclass(frozen=True)
@@ -156,9 +142,16 @@ def reachable(
         # a bead lies below its tip
         tip_mm = by.low_z_mm + (k + 1) * by.size_z_mm + tip_layers * by.layer_mm
         free = tip_mm >= by.least_mm - by.allowed_mm
-        near = ndimage.distance_transform_edt(~free) * by.cell_mm <= 0.5 * by.bead_mm
+        near = _within(0.5 * by.bead_mm, free, by.cell_mm)
         if held and by.low_z_mm + (k - below) * by.size_z_mm > 0 and k >= below:
             floor = stands[:, :, k - below] | reach[:, :, k - below]
-            near &= ndimage.distance_transform_edt(~floor) * by.cell_mm <= by.bead_mm
+            near &= _within(by.bead_mm, floor, by.cell_mm)
         reach[:, :, k] = missing[:, :, k] & near
     return reach
+
+
+def _within(reach_mm: float, of: np.ndarray, cell_mm: float) -> np.ndarray:
+    """Cells that lie within a reach of some."""
+    if of.all():
+        return of
+    return np.asarray(ndimage.distance_transform_edt(~of) * cell_mm <= reach_mm)

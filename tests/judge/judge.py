@@ -10,7 +10,7 @@ import trimesh
 from numba import njit
 from scipy import ndimage
 
-from tests.judge.head import MK3S_HEAD, HeadSlice, Reaching, least_tip, reachable, under_cone
+from tests.judge.head import MK3S_HEAD, HeadSlice, Reaching, grown, reachable, tip_under
 from tests.judge.text import Steps, read_steps
 from tests.judge.voxels import Voxels, column_tops, occupancy
 
@@ -94,8 +94,9 @@ def judge(
     steps = read_steps(text)
     scene = _Scene.of(stands, wanted, piece_box_mm)
     box, before, missing = scene.box, scene.before, scene.aim & ~scene.before
+    over_mm = tuple(grown(scene.tops_mm, FINE_MM[0], part) for part in head)
     reaching = Reaching(
-        least_mm=least_tip(scene.tops_mm, scene.window, FINE_MM[0], head),
+        least_mm=tip_under(over_mm, head, scene.window),
         cell_mm=FINE_MM[0], low_z_mm=float(box.low_mm[2]), size_z_mm=FINE_MM[2],
         bead_mm=bead_mm, layer_mm=HANGING_MM, allowed_mm=0.1,
     )  # fmt: skip
@@ -103,7 +104,7 @@ def judge(
         reachable(missing, before, reaching, tip_layers=layers, held=held)
         for layers, held in ((0.5, True), (1.0, True), (1.0, False))
     )
-    contact, line = _contact(steps, scene.tops_mm, scene.field_low_mm, FINE_MM[0], head)
+    contact, line = _contact(steps, over_mm, scene.field_low_mm, FINE_MM[0], head)
     state = before.astype(np.uint8)
     lost, widest = _lay(
         steps.start_mm, steps.end_mm, steps.pushed_mm3, state, box.low_mm, box.size_mm,
@@ -237,28 +238,18 @@ def _lay(starts, ends, pushed, state, low, size, disc, distance, most_gap, hangi
 
 
 def _contact(
-    steps: Steps, tops: np.ndarray, low: np.ndarray, cell: float, head: tuple[HeadSlice, ...]
+    steps: Steps,
+    over_mm: tuple[np.ndarray, ...],
+    low: np.ndarray,
+    cell: float,
+    head: tuple[HeadSlice, ...],
 ) -> tuple[float, int]:
     """Deepest contact of the head with what stood there, mm, and its line."""
     worst, line = -np.inf, 0
-    for part in head if len(steps.line) else ():
-        if part.radius_to_mm > 0:
-            under, over = np.zeros((1, 2), np.int64), under_cone(tops, cell, part)
-        elif part.box_mm is None:
-            n = int(np.ceil(part.radius_mm / cell))
-            i, j = np.mgrid[-n : n + 1, -n : n + 1]
-            under = np.argwhere(np.hypot(i, j) * cell < part.radius_mm) - n
-            over = tops
-        else:
-            x0, y0, x1, y1 = (v / cell for v in part.box_mm)
-            size = (int(x1 - x0) | 1, int(y1 - y0) | 1)
-            middle = (round((x0 + x1) / 2), round((y0 + y1) / 2))
-            under = np.zeros((1, 2), np.int64)
-            over = ndimage.maximum_filter(tops, size, mode="constant")
-            over = ndimage.shift(over, (-middle[0], -middle[1]), order=0, cval=0.0)
-        depth, at = _deepest(
-            steps.start_mm, steps.end_mm, over, low, cell, part.above_mm, under, tops.max()
-        )
+    for over, part in zip(over_mm, head, strict=True):
+        if not len(steps.line):
+            break
+        depth, at = _deepest(steps.start_mm, steps.end_mm, over, low, cell, part.above_mm)
         if depth > worst:
             worst, line = depth, int(steps.line[at])
     return float(worst), line
@@ -317,8 +308,8 @@ def _deepest_cone(starts, ends, tops, low, cell, above, rim, rim_to, rise):
 
 
 @njit(cache=True)
-def _deepest(starts, ends, grown, low, cell, above, under, highest):
-    worst, at = -1e9, 0
+def _deepest(starts, ends, grown, low, cell, above):
+    worst, at, highest = -1e9, 0, grown.max()
     nx, ny = grown.shape
     for m in range(len(starts)):
         d = ends[m] - starts[m]
@@ -329,13 +320,9 @@ def _deepest(starts, ends, grown, low, cell, above, under, highest):
             p = starts[m] + d * (s / count)
             ci = int(np.floor((p[0] - low[0]) / cell))
             cj = int(np.floor((p[1] - low[1]) / cell))
-            if ci < -60 or cj < -60 or ci >= nx + 60 or cj >= ny + 60:
+            if ci < 0 or cj < 0 or ci >= nx or cj >= ny:
                 continue
-            for u in range(len(under)):
-                i, j = ci + under[u, 0], cj + under[u, 1]
-                if i < 0 or j < 0 or i >= nx or j >= ny:
-                    continue
-                depth = grown[i, j] - (p[2] + above)
-                if depth > worst:
-                    worst, at = depth, m
+            depth = grown[ci, cj] - (p[2] + above)
+            if depth > worst:
+                worst, at = depth, m
     return worst, at
