@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from gcode.solids import as_manifold
 
 if TYPE_CHECKING:
     import trimesh
+
+
+_solids: dict[int, Any] = {}  # by the mesh's id, as long as the mesh lives
 
 
 class MeshShape:
@@ -33,5 +37,10 @@ class MeshShape:
         return mesh_points(self.mesh, spacing_mm)
 
     def solid(self) -> Any:
-        """The part as a `manifold3d.Manifold`."""
-        return as_manifold(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces))
+        """The part as a `manifold3d.Manifold`, made once: nobody changes a template's mesh."""
+        key = id(self.mesh)
+        if key not in _solids:
+            mesh = self.mesh
+            _solids[key] = as_manifold(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+            weakref.finalize(mesh, _solids.pop, key, None)
+        return _solids[key]
