@@ -20,8 +20,10 @@ from amrepair.regions import Label, detect
 from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
+from amrepair.template import MeshSdf
 from tests import analytic
 from tests.analytic import AnalyticTemplate
+from tests.unit.loop_bench import solid_mesh
 
 IN_PLACE = Transform.identity("build", "template")
 SIGMA_MM = 0.04
@@ -153,7 +155,8 @@ def test_regions_that_detection_found_are_measured_by_solids(name: str) -> None:
     assert region.volume_mm3 == pytest.approx(truth.volume(), rel=0.05)
     assert region.depth_mm == anomaly.regions[0].depth_mm
     bounds = np.array(truth.bounding_box()).reshape(2, 3)
-    assert np.abs(region.box_mm - bounds).max() < 0.5
+    # a film of the wall's noise goes on as far as what was eroded is grown back
+    assert np.abs(region.box_mm - bounds).max() < 0.65
 
 
 def test_a_region_without_a_solid_keeps_what_its_surface_told() -> None:
@@ -403,3 +406,18 @@ def test_a_field_that_touches_zero_by_less_than_a_nanometre_is_no_solid() -> Non
     field = np.full(box.shape, 0.3)
     field[2, 2, 2] = -4e-7
     assert not solids_from_field(box, field, 0.0)
+
+
+def test_a_break_that_runs_out_at_an_acute_angle_leaves_no_fin() -> None:
+    # regression: samples rounded the rim off, and a fin of up to 0.5 mm that is not there kept the
+    # head away: of a pit beside a hole 0.88 of what is in reach was filled, 0.95 now
+    hole = manifold3d.Manifold.cylinder(40.0, 3.0, 3.0, 96).translate((15.0, 10.0, -1.0))
+    whole = manifold3d.Manifold.cube((30.0, 20.0, 12.0)) - hole
+    pit = manifold3d.Manifold.cylinder(10.0, 3.0, 3.0, 96).translate((19.4, 10.0, 8.0))
+    template = MeshSdf.from_mesh(solid_mesh(whole))
+    scan = cloud(whole - pit)
+    deficit = compute_deficit(
+        scan, template, detect(scan, template, pose="told"), build_from_template=IN_PLACE
+    )
+    left = (whole ^ pit) - deficit.missing
+    assert left.volume() < 0.0115 * (whole ^ pit).volume()
