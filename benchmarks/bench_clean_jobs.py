@@ -12,9 +12,9 @@ is expected, `plan_repair`, `typed` and `decide_look` what is to be done, `rewri
 next layer's flow changes. Nothing is wrong with any of them, so whatever is done is a false alarm.
 
 Counted are repairs, looks that claim more than 10 mm³ of excess (so many millimetres cubed of
-regions, of whatever size each), changed layers and halts. Lines of JSON in `--results`, one a job,
-every region with its box. Scans are kept in `--folder` and judged again by other code, so that two
-versions of it see the same points.
+regions, of whatever size each), changed layers and halts, offers to print again among them. Lines
+of JSON in `--results`, one a job, every region with its box. Scans are kept in `--folder` and
+judged again by other code, so that two versions of it see the same points.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from amrepair.loop.learning import Learning
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.sites import sites
 from amrepair.loop.situation import decide_look
+from amrepair.loop.thin_layers import with_covered
 from amrepair.policy.table import Action
 from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan, ScanRequest
@@ -294,6 +295,7 @@ def judged(
             interruption=job.state_after(stop.line), rng=rng,
         )  # fmt: skip
         plan = typed(plan, job, site, stop.line, pose)
+        plan = with_covered(plan, job, site.expected, stop)
         decision = decide_look(plan, job, site, stop, (), seen_twice=bool(twice), limits=None)
         learning.note(stop, plan, decision)
         if decision.action is not Action.LOOK_AGAIN:
@@ -305,7 +307,8 @@ def judged(
     return figures(stop, plan, decision.verdicts, changed) | {
         "action": str(decision.action),
         "repair_mm3": round(sum(r.volume_mm3 for r in plan.to_fill), 2),
-        "halted": decision.action in HALTS,
+        "halted": decision.action in (*HALTS, Action.OFFER),
+        "covered_mm3": 0.0 if plan.covered is None else round(plan.covered.piece.volume_mm3, 2),
         "twice": bool(twice),
     }
 
