@@ -48,6 +48,7 @@ from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
+from amrepair.simulate.placed import PlacedDefect
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from amrepair.template import MeshSdf, load_mesh
@@ -204,9 +205,16 @@ def stops_of(job: Job, looks: int) -> tuple[Stop, ...]:
 
 
 def scans_of(
-    job: Job, stops: Sequence[Stop], told: WorldParameters, scanner_name: str, seed: int
+    job: Job,
+    stops: Sequence[Stop],
+    told: WorldParameters,
+    scanner_name: str,
+    seed: int,
+    defects: Sequence[PlacedDefect] = (),
 ) -> Iterator[tuple[tuple[Scan, Scan], Transform]]:
-    """What a scanner sees at every stop of a job printed without a defect, and if it looks again.
+    """What a scanner sees at every stop of a job, printed without a defect if none is told.
+
+    And what it sees if it looks again.
 
     Its errors are drawn anew for another look. Those of a real one may be the same.
     """
@@ -230,7 +238,7 @@ def scans_of(
     for stop in stops:
         layer = len(job.layers) - 1 if stop.layer_index is None else stop.layer_index
         if layer > done:
-            world.deposit(noisy_flow(motion_of(job, done + 1, layer), flow_rng, told.flow))
+            world.deposit(noisy_flow(motion_of(job, done + 1, layer), flow_rng, told.flow), defects)
             done = layer
         asked = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
         yield (scanner.scan(asked), scanner.scan(asked)), scanner.build_from_scanner
