@@ -12,9 +12,9 @@ is expected, `plan_repair`, `typed` and `decide_look` what is to be done, `rewri
 next layer's flow changes. Nothing is wrong with any of them, so whatever is done is a false alarm.
 
 Counted are repairs, looks that claim more than 10 mm³ of excess (so many millimetres cubed of
-regions, of whatever size each), changed layers and halts. Lines of JSON in `--results`, one a job,
-every region with its box. Scans are kept in `--folder` and judged again by other code, so that two
-versions of it see the same points.
+regions, of whatever size each), changed layers and halts, offers to print again among them. Lines
+of JSON in `--results`, one a job, every region with its box. Scans are kept in `--folder` and
+judged again by other code, so that two versions of it see the same points.
 """
 
 from __future__ import annotations
@@ -42,11 +42,13 @@ from amrepair.loop.learning import Learning
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.sites import sites
 from amrepair.loop.situation import decide_look
+from amrepair.loop.thin_layers import with_covered
 from amrepair.policy.table import Action
 from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan, ScanRequest
 from amrepair.simulate.flow import noisy_flow
 from amrepair.simulate.parameters import DEFAULT_SCANNER, WorldParameters, load_world
+from amrepair.simulate.placed import PlacedDefect
 from amrepair.simulate.scanner import SimulatedScanner
 from amrepair.simulate.world import World
 from amrepair.template import MeshSdf, load_mesh
@@ -203,9 +205,16 @@ def stops_of(job: Job, looks: int) -> tuple[Stop, ...]:
 
 
 def scans_of(
-    job: Job, stops: Sequence[Stop], told: WorldParameters, scanner_name: str, seed: int
+    job: Job,
+    stops: Sequence[Stop],
+    told: WorldParameters,
+    scanner_name: str,
+    seed: int,
+    defects: Sequence[PlacedDefect] = (),
 ) -> Iterator[tuple[tuple[Scan, Scan], Transform]]:
-    """What a scanner sees at every stop of a job printed without a defect, and if it looks again.
+    """What a scanner sees at every stop of a job, printed without a defect if none is told.
+
+    And what it sees if it looks again.
 
     Its errors are drawn anew for another look. Those of a real one may be the same.
     """
@@ -229,7 +238,7 @@ def scans_of(
     for stop in stops:
         layer = len(job.layers) - 1 if stop.layer_index is None else stop.layer_index
         if layer > done:
-            world.deposit(noisy_flow(motion_of(job, done + 1, layer), flow_rng, told.flow))
+            world.deposit(noisy_flow(motion_of(job, done + 1, layer), flow_rng, told.flow), defects)
             done = layer
         asked = ScanRequest(stop.label, stop.layer_index, stop.z_mm)
         yield (scanner.scan(asked), scanner.scan(asked)), scanner.build_from_scanner
@@ -294,6 +303,7 @@ def judged(
             interruption=job.state_after(stop.line), rng=rng,
         )  # fmt: skip
         plan = typed(plan, job, site, stop.line, pose)
+        plan = with_covered(plan, job, site.expected, stop)
         decision = decide_look(plan, job, site, stop, (), seen_twice=bool(twice), limits=None)
         learning.note(stop, plan, decision)
         if decision.action is not Action.LOOK_AGAIN:
@@ -305,7 +315,8 @@ def judged(
     return figures(stop, plan, decision.verdicts, changed) | {
         "action": str(decision.action),
         "repair_mm3": round(sum(r.volume_mm3 for r in plan.to_fill), 2),
-        "halted": decision.action in HALTS,
+        "halted": decision.action in (*HALTS, Action.OFFER),
+        "covered_mm3": 0.0 if plan.covered is None else round(plan.covered.piece.volume_mm3, 2),
         "twice": bool(twice),
     }
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
-from amrepair.loop.buried_defects import buried, buried_mm3, ways
+from amrepair.loop.buried_defects import buried, buried_mm3, pieces_of, ways
 from amrepair.loop.locate import locate_parts
 from amrepair.loop.looks import plan_stops
+from amrepair.loop.thin_layers import with_covered
 from amrepair.policy.remedies import Way
 from amrepair.repair import RepairPlan
 from amrepair.template.port import Template
@@ -37,16 +38,20 @@ class Afterwards:
         None where that is too little to ask about (`PolicyOptions.buried_mm3`).
     not_again
         Why the job cannot be printed again from a layer on; empty where it can, or nobody asks.
+    covered
+        Which layers lack plastic under later ones, in words; empty where none are told.
     """
 
     buried_mm3: float
     ways: tuple[Way, ...] = ()
     not_again: str = ""
+    covered: str = ""
 
     @property
     def told(self) -> tuple[str, ...]:
-        """A sentence for each way, and for why one of them is none."""
-        lines = [way.told for way in self.ways]
+        """A sentence for what is covered, for each way, and for why one of them is none."""
+        lines = [self.covered] if self.covered else []
+        lines += [way.told for way in self.ways]
         if self.not_again:
             lines.append(f"the job cannot be printed again from a layer on: {self.not_again}")
         return tuple(lines)
@@ -65,8 +70,8 @@ def afterwards(
         That makes the job that is left, without the layer.
     """
     *_, end = plan_stops(job, ())
-    pieces = () if plan.patch is None else plan.patch.regions
-    left = buried(pieces, end, plan.layer_height_mm, plan.policy)
+    plan = with_covered(plan, job, template, end)
+    left = buried(pieces_of(plan, ()), end, plan.layer_height_mm, plan.policy)
     open_mm3 = buried_mm3(left)
     if open_mm3 < plan.policy.buried_mm3:
         return Afterwards(open_mm3)
@@ -77,7 +82,8 @@ def afterwards(
         not_again = _why_not_again(job, template, placed, setup)
     if not_again:
         offered = tuple(way for way in offered if way.layer is None)
-    return Afterwards(open_mm3, offered, not_again)
+    covered = "" if plan.covered is None else plan.covered.told
+    return Afterwards(open_mm3, offered, not_again, covered)
 
 
 def _why_not_again(job: Job, template: Template, placed: Transform, setup: PrintSetup) -> str:

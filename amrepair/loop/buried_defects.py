@@ -13,6 +13,7 @@ from amrepair.loop.looks import Look, Stop
 from amrepair.policy import DEFAULT_POLICY, PolicyOptions
 from amrepair.policy.remedies import Way
 from amrepair.repair import RepairPlan
+from amrepair.repair.plan import CoveredLayers
 from gcode.estimate import estimate
 from gcode.profiles import PrintSetup
 from gcode.reader import Job
@@ -23,11 +24,19 @@ def pieces_of(plan: RepairPlan, here: Sequence[Look]) -> tuple[PatchRegion, ...]
     """Pieces of what is missing at a stop, and how far they are, or were, filled.
 
     A repair covers what it could not get to, so that no later look sees that: what was printed last
-    at this stop tells of it. `here` are its earlier looks.
+    at this stop tells of it. `here` are its earlier looks. What later layers had covered before is
+    as the first look has it: the walls that tell of it stand in as before.
     """
     printed = [look.plan for look in here if look.printed]
     patch = printed[-1].patch if printed else plan.patch
-    return () if patch is None else patch.regions
+    pieces = () if patch is None else patch.regions
+    covered = covered_at(plan, here)
+    return pieces if covered is None else (*pieces, covered.piece)
+
+
+def covered_at(plan: RepairPlan, here: Sequence[Look]) -> CoveredLayers | None:
+    """Layers that lack plastic under later ones, as a stop's first look has them."""
+    return (here[0].plan if here else plan).covered
 
 
 def buried(

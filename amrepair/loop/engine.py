@@ -29,6 +29,7 @@ from amrepair.loop.options import Approval, LoopOptions, Records
 from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import ANEW, LOOK_EVENTS, TapeEndsError
+from amrepair.loop.thin_layers import with_covered
 from amrepair.loop.wire import Mover, Wire
 from amrepair.policy import Action, Decision
 from amrepair.repair import RepairPlan, Site, plan_repair
@@ -407,6 +408,7 @@ class Run:
                 mended=self._filled_before(stop),
                 options=self._options.kinds,
             )
+            plan = with_covered(plan, self._job, site.expected, stop, self._looks)
             decision = decide_look(
                 plan,
                 self._job,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from amrepair.loop.buried_defects import buried, buried_mm3, pieces_of, ways
+from amrepair.loop.buried_defects import buried, buried_mm3, covered_at, pieces_of, ways
 from amrepair.loop.filaments import other_material
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
@@ -71,7 +71,9 @@ def decide_look(
     decision = decide(verdicts, situation, policy)
     if decision.action is not Action.OFFER:
         return decision
-    return replace(decision, ways=ways(left, job, stop, site.setup))
+    covered = covered_at(plan, here)
+    reason = decision.reason if covered is None else f"{covered.told}; {decision.reason}"
+    return replace(decision, reason=reason, ways=ways(left, job, stop, site.setup))
 
 
 def _stuck(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:

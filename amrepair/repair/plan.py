@@ -13,7 +13,40 @@ from amrepair.regions.error_calibration_fit import Sound
 from amrepair.scans import Scan
 from gcode.check import CheckedProgram
 from gcode.estimate import Estimate
-from gcode.slicing.patch import PatchPlan
+from gcode.slicing.patch import PatchPlan, PatchRegion
+
+
+@dataclass(frozen=True, slots=True)
+class CoveredLayers:
+    """Layers of a job that lack plastic under later ones, where no look from above sees it.
+
+    Attributes
+    ----------
+    first, last
+        Indices of the layers.
+    lacking_ratio
+        Share of their plastic that did not come out.
+    piece
+        What of that stays open, of which the nozzle reaches nothing.
+    """
+
+    first: int
+    last: int
+    lacking_ratio: float
+    piece: PatchRegion
+
+    @property
+    def told(self) -> str:
+        """One sentence for people."""
+        which = (
+            f"layer {self.first} lacks"
+            if self.first == self.last
+            else (f"layers {self.first} to {self.last} lack")
+        )
+        return (
+            f"{which} about {100.0 * self.lacking_ratio:.0f} % of the plastic, by how far their "
+            f"walls stand in: {self.piece.volume_mm3:.0f} mm³ lie open inside, under later layers"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +71,8 @@ class RepairPlan:
     beds
         The scanner's errors as the bed beside the part showed them, in this look and in earlier
         looks of the same run.
+    covered
+        Layers that lack plastic under later ones; None where none are told, or nobody asked.
 
     Examples
     --------
@@ -64,6 +99,7 @@ class RepairPlan:
     estimate: Estimate | None = None
     refused: str = ""
     beds: tuple[Sound, ...] = ()
+    covered: CoveredLayers | None = None
 
     @property
     def build_from_template(self) -> Transform:
