@@ -408,7 +408,9 @@ class Run:
                 mended=self._filled_before(stop),
                 options=self._options.kinds,
             )
-            plan = with_covered(plan, self._job, site.expected, stop, self._looks)
+            plan = with_covered(
+                plan, self._job, site.expected, stop, self._looks, self._options.kinds.thin
+            )
             decision = decide_look(
                 plan,
                 self._job,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from amrepair.loop.layer_shift import DEFAULT_SHIFT, ShiftOptions
+from amrepair.loop.thin_layers import DEFAULT_THIN, ThinLayersOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,8 @@ class KindOptions:
         Steepness of a top, and of a wall.
     shift
         What it takes to tell that layers lie aside of those below, by what is seen from above.
+    thin
+        What it takes to tell that layers lack plastic under later ones, by how walls stand in.
     """
 
     moved_mm: float = 0.8
@@ -106,6 +109,7 @@ class KindOptions:
     top_cosine: float = 0.8
     wall_cosine: float = 0.4
     shift: ShiftOptions = DEFAULT_SHIFT
+    thin: ThinLayersOptions = DEFAULT_THIN
 
 
 DEFAULT_KINDS = KindOptions()
