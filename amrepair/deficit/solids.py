@@ -172,7 +172,7 @@ def _shaped(sought: Sought, box: VoxelBox, reach: Voxels, clip: Values, f_mm: Va
 def _beyond_the_surface(
     field: Voxels, stands: Voxels, reach: Voxels, own: VoxelMask, sure: VoxelMask
 ) -> Voxels:
-    """What differs, two samples on beyond the template's surface, whose own solid then cuts it.
+    """What differs, by a cube on beyond the template's surface, whose own solid then cuts it.
 
     Between samples edges would be rounded, and a thin wall lost: where a break runs out at an
     acute angle, a fin that is not there would be left of the part. Farther from what surely
