@@ -20,7 +20,7 @@ from gcode.progress import Progress
 # A corner of a cube of side τ lies √3 τ from the eroded template.
 GROW_FACTOR = 3**0.5
 # So that none of its cubes' corners on the template's surface is left out.
-SAMPLES_BEYOND = 3**0.5
+SAMPLES_BEYOND = 2.0
 # Farther than anything that is asked for.
 FAR_MM = 10.0
 
@@ -89,15 +89,13 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
         core[found] = sought.nearest_is_labelled(samples[found])
     else:
         core = _of_a_region(core, box, sought.told_mm(inside), s.cell_mm)
-    reach = _grown_back(sought, box, core & ~line, core & line)
-    field = _shaped(sought, box, reach, clip, f)
+    field = _grown_back(sought, box, core & ~line, core & line, clip, f)
     options = sought.options.voxels
-    if np.isfinite(finest_mm) and box.step_mm.max() <= options.coarsest_mm:
+    if box.step_mm.max() <= options.coarsest_mm:
         return solids_from_field(box, field, options.crumb_mm3)
-    sure = (cautious > limit_mm / 2).reshape(box.shape) & (field < 0)
-    own = (sought.sign * f > 0).reshape(box.shape)
-    open_ = _beyond_the_surface(field, -best.reshape(box.shape), reach, own, sure)
-    return _cut_to_design(sought, solids_from_field(box, open_, options.crumb_mm3))
+    sure = (cautious > limit_mm / 2).reshape(box.shape)
+    beyond = _beyond_the_surface(field, (sought.sign * f > 0).reshape(box.shape), sure)
+    return cut_to_design(sought, solids_from_field(box, beyond, options.crumb_mm3))
 
 
 def _shown(
@@ -143,8 +141,10 @@ def _limits(
     return limit_mm, thin_mm
 
 
-def _grown_back(sought: Sought, box: VoxelBox, core: Mask, line: Mask) -> Voxels:
-    """How far samples lie from the core, less what the erosion took of it.
+def _grown_back(
+    sought: Sought, box: VoxelBox, core: Mask, line: Mask, clip: Values, f_mm: Values
+) -> Voxels:
+    """The core, grown by what the erosion took and clipped to template minus as-built.
 
     Nothing was taken of a line of the job that is gone: it is as wide as it was planned.
     """
@@ -154,13 +154,8 @@ def _grown_back(sought: Sought, box: VoxelBox, core: Mask, line: Mask) -> Voxels
         box.distance_to(core.reshape(box.shape)) - grow_mm,
         box.distance_to(line.reshape(box.shape)) - sample_mm,
     )
-    return np.minimum(reach, FAR_MM)
-
-
-def _shaped(sought: Sought, box: VoxelBox, reach: Voxels, clip: Values, f_mm: Values) -> Voxels:
-    """The core, grown back and clipped to template minus as-built."""
     shaped = clip.reshape(box.shape)
-    field = np.maximum(shaped, reach)
+    field = np.maximum(shaped, np.minimum(reach, FAR_MM))
     if not sought.is_excess:
         wanted = f_mm.reshape(box.shape) < 0
         field = np.where(_hangs_free(wanted, shaped < 0, field < 0), shaped, field)
@@ -169,34 +164,26 @@ def _shaped(sought: Sought, box: VoxelBox, reach: Voxels, clip: Values, f_mm: Va
     return np.where(enclosed, sought.sign * -f_mm.reshape(box.shape), field)
 
 
-def _beyond_the_surface(
-    field: Voxels, stands: Voxels, reach: Voxels, own: VoxelMask, sure: VoxelMask
-) -> Voxels:
-    """What differs, by a cube on beyond the template's surface, whose own solid then cuts it.
+def _beyond_the_surface(field: Voxels, own: VoxelMask, sure: VoxelMask) -> Voxels:
+    """Of a coarse grid: what surely differs, two samples on beyond the template's surface.
 
-    Between samples edges would be rounded, and a thin wall lost: where a break runs out at an
-    acute angle, a fin that is not there would be left of the part. Farther from what surely
-    differs a film along a wall is noise.
+    Between such samples a thin wall would be lost, and every edge rounded. The template's solid
+    cuts it instead.
 
     Parameters
     ----------
-    field
-        What differs, as far as the template's surface.
-    stands
-        How far samples lie in what stands there (of excess: outside of it).
-    reach
-        How far they lie from where something may differ.
     own, sure
         On which side of the template's surface something can differ, and where it surely does.
     """
-    if not sure.any():
+    if not own.any():
         return field
-    near = ndimage.distance_transform_edt(~sure) <= SAMPLES_BEYOND
-    within = np.where(field < 0, np.minimum(stands, field), np.maximum(stands, field))
-    return np.where(near, np.where(own, within, np.maximum(stands, reach)), field)
+    away, nearest = ndimage.distance_transform_edt(~own, return_indices=True)
+    differs = sure & (field < 0)
+    beyond = ~own & (away <= SAMPLES_BEYOND) & differs[tuple(nearest)]
+    return np.where(beyond, -np.abs(field), field)
 
 
-def _cut_to_design(sought: Sought, pieces: list[manifold3d.Manifold]) -> list[manifold3d.Manifold]:
+def cut_to_design(sought: Sought, pieces: list[manifold3d.Manifold]) -> list[manifold3d.Manifold]:
     """Of pieces what lies in the template where something is missing, else what lies outside."""
     if not pieces:
         return pieces
