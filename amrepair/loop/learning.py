@@ -77,7 +77,7 @@ def by_bed(plan: RepairPlan) -> Calibration | None:
 def _as_normal(seen: list[Sound]) -> bool:
     """Whether windows wander by no more than normal noise and the process leave, at any width."""
     return all(
-        float(np.median([scale.unexplained_mm for scale in alike])) == 0.0
+        float(np.median([scale.common_mm for scale in alike])) == 0.0
         for alike in by_width(seen).values()
     )
 

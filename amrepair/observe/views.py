@@ -39,16 +39,6 @@ class Shares:
         """(n,) how many views saw the place of each entry."""
         return np.bincount(self.place)[self.place]
 
-    def seen_by(self, places: int) -> Values:
-        """(n,) how many views each place's mean is worth; one that gave most points is most of it.
-
-        Views err each on its own, so that the mean over n_v points of each view v errs as that of
-        (Σ n_v)² / Σ n_v² views (Kish 1965, effective sample size). Places without a view have 1.
-        """
-        square = np.bincount(self.place, np.square(self.count.astype(np.float64)), places)
-        points = np.bincount(self.place, self.count, places)
-        return np.divide(points**2, square, out=np.ones(places), where=square > 0.0)
-
     @property
     def apart_mm(self) -> float | None:
         """Robust standard deviation between views of a place; None where none has several views."""

@@ -33,9 +33,9 @@ class SoundScale:
     wander_mm, freedom
         (c,) standard deviation of window means for each class of how well windows were seen, and
         its degrees of freedom.
-    window_mm, unexplained_mm, error_mm
-        Medians of the independent part of a window's standard error, of what windows wander by
-        beyond what is known of errors, and of the standard error of the tested statistic.
+    window_mm, common_mm, error_mm
+        Medians of the independent part of a window's standard error, of the part that its cells
+        have in common, and of the standard error of the tested statistic.
     far_mm
         For missing and for excess: how far beyond the tolerance outliers lie.
     """
@@ -46,7 +46,7 @@ class SoundScale:
     wander_mm: Float[np.ndarray, " c"]
     freedom: Float[np.ndarray, " c"]
     window_mm: float
-    unexplained_mm: float
+    common_mm: float
     error_mm: float
     far_mm: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]
 
@@ -65,7 +65,7 @@ def sound_scales(levels: Sequence[Level], options: RegionOptions) -> Sound:
             level.errors.wander_mm,
             level.errors.freedom,
             float(np.median(level.errors.window_mm)),
-            float(np.median(level.errors.unexplained_mm)),
+            float(np.median(level.errors.common_mm)),
             float(np.median(level.error_mm)),
             level.far_mm(options.tail_from),
         )

@@ -51,8 +51,7 @@ class Inspected:
         (b,) cosine of the angle of incidence.
     pose_mm
         (b,) standard error that neighbouring places share: from the pose, the size and the bow of
-        the part, from views that disagree, by how many saw the place, and from where in a pixel its
-        ray passed.
+        the part, from views that disagree, and from where in a pixel its ray passed.
     ends
         How many of the places, the last ones, are ends of walls.
     """

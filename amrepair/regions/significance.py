@@ -100,9 +100,8 @@ class Errors:
     ----------
     cell_mm, window_mm
         (s,) independent part of the standard error of a cell's value, and of a window's median.
-    common_mm, unexplained_mm
-        (s,) part of the standard error that all cells of a window share; and how much of it is what
-        windows wander by beyond what the process and the noise explain.
+    common_mm
+        (s,) part of the standard error that all cells of a window share.
     wander_mm, freedom
         (c,) standard deviation of window means, for each class of how well windows were seen, and
         the degrees of freedom of its estimate.
@@ -115,7 +114,6 @@ class Errors:
     cell_mm: Values
     window_mm: Values
     common_mm: Values
-    unexplained_mm: Values
     wander_mm: Float[np.ndarray, " c"]
     freedom: Float[np.ndarray, " c"]
     group: Numbers
@@ -305,11 +303,10 @@ def _errors(
     # the calibration has seen nothing so far aslant: there errors grow
     aslant = 1.0 if calibration is None else np.maximum(calibration.facing / facing, 1.0)
     explained = options.process_sigma_mm**2 + window**2
-    unexplained = np.sqrt(np.maximum((wander[group] * aslant) ** 2 - explained, 0.0))
-    common = np.hypot(unexplained, pose_mm)
+    common = np.sqrt(np.maximum((wander[group] * aslant) ** 2 - explained, 0.0) + pose_mm**2)
     few = min(options.least_cells, len(facing)) - 1
     least = float(np.partition(facing, few)[few])
-    return Errors(cell, window, common, unexplained, wander, freedom, group, least)
+    return Errors(cell, window, common, wander, freedom, group, least)
 
 
 def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:

@@ -55,9 +55,6 @@ def without_systematic_errors(
         nuisance, shares = None, seen.shares
         if pose != "told":
             nuisance, inspected, shares = _without_nuisance(seen, inspected, pose, options)
-        if shares is not None:
-            views_mm = _between_views_mm(shares, len(inspected.value_mm), seen.surfels.spread_mm)
-            inspected = replace(inspected, pose_mm=np.hypot(inspected.pose_mm, views_mm))
         if out or shares is None:
             return _as_made(seen, nuisance), inspected, nuisance, out
         feet_mm = inspected.place_mm[: inspected.cells]
@@ -117,6 +114,8 @@ def _without_nuisance(
     whole_mm = inspected.value_mm.copy()
     whole_mm[:n] -= np.bincount(told.place, told.count * share_mm, n) / points
     pose_mm = np.hypot(inspected.pose_mm, found.error_mm(inspected.place_mm, inspected.normal))
+    if views_known:
+        pose_mm = np.hypot(pose_mm, _between_views_mm(left, len(pose_mm), seen.surfels.spread_mm))
     inspected = replace(inspected, value_mm=whole_mm, pose_mm=pose_mm)
     return found, inspected, left if views_known else None
 
@@ -124,13 +123,12 @@ def _without_nuisance(
 def _between_views_mm(shares: Shares, places: int, point_sigma_mm: float) -> Values:
     """(n,) standard error of each place from the disagreement of the views that saw it.
 
-    The variance between views, less what the noise of their points explains, divided by how many
-    views the place's mean is worth; a place that only rays passed counts as seen by one. What whole
-    views are off by is a part of it, unless it was taken out: where the pose is told nothing was.
+    The variance between views, less what the noise of their points explains, divided by the number
+    of views; a place that only rays passed counts as seen by one.
     """
     apart_mm = shares.apart_mm
     if apart_mm is None:
         return np.zeros(places)
     noise_mm = point_sigma_mm * float(np.median(1.0 / np.sqrt(shares.count[shares.views > 1])))
-    variance = max(apart_mm**2 - noise_mm**2, 0.0)
-    return np.asarray(np.sqrt(variance / shares.seen_by(places)))
+    views = np.maximum(np.bincount(shares.place, minlength=places), 1)
+    return np.asarray(np.sqrt(max(apart_mm**2 - noise_mm**2, 0.0) / views))

@@ -7,9 +7,7 @@ import pytest
 
 from amrepair.observe.incidence import incidence
 from amrepair.observe.rays import MIN_COSINE
-from amrepair.observe.views import Shares
 from amrepair.regions import detect
-from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.scans import RangeGrid, Scan
 from tests.analytic import AnalyticTemplate, sample_surface, sphere
 
@@ -22,18 +20,9 @@ def ball() -> AnalyticTemplate:
 
 
 def views(
-    ball: AnalyticTemplate,
-    seed: int,
-    count: int = VIEWS,
-    *,
-    off_mm: float = 0.0,
-    of: int = 0,
-    wave_mm: float = 0.0,
+    ball: AnalyticTemplate, seed: int, count: int = VIEWS, *, off_mm: float = 0.0, of: int = 0
 ) -> Scan:
-    """Views from all around, each of its half; one of them lies aside by so much, along x.
-
-    Each errs on its own by three waves, so many millimetres high, which hang together over 6 mm.
-    """
+    """Views from all around, each of its half; one of them lies aside by so much, along x."""
     rng = np.random.default_rng(seed)
     clouds, ways = [], []
     for k in range(count):
@@ -42,9 +31,6 @@ def views(
         points, normals = sample_surface(ball.body, 0.5, seed=10 * seed + k)
         seen = normals @ way > 0.1
         noise = rng.normal(scale=0.03, size=(int(seen.sum()), 1))
-        if wave_mm:
-            waves = np.sin(2 * np.pi * points[seen] / 12.0 + rng.uniform(0.0, 2 * np.pi, 3))
-            noise += wave_mm * waves.sum(axis=1, keepdims=True)
         shift = np.array([off_mm if k == of else 0.0, 0.0, 0.0])
         clouds.append(points[seen] + noise * normals[seen] + shift)
         ways.append(200.0 * way)
@@ -86,26 +72,6 @@ def test_a_dent_that_several_views_see_is_no_contradiction(ball: AnalyticTemplat
     found = detect(Scan(points, 0.04, "template", None, scan.sensors_mm, scan.sensor_index), ball)
     assert found.contradicting == ()
     assert [region.label.name for region in found.regions] == ["MISSING"]
-
-
-def test_where_the_pose_is_told_views_that_err_on_their_own_are_no_defect(
-    ball: AnalyticTemplate,
-) -> None:
-    scan = views(ball, 0, wave_mm=0.08)  # three false regions, before this counted there
-    found = detect(scan, ball, pose="told", calibration=NORMAL_NOISE)
-    assert found.regions == ()
-    assert found.calibration == NORMAL_NOISE
-    assert found.inspected is not None
-    one, several = (float(told) for told in np.quantile(found.inspected.pose_mm, [1.0, 0.1]))
-    spread_mm = 0.08 * np.sqrt(3 / 2)  # of a view; two or three saw most places
-    assert one == pytest.approx(spread_mm, rel=0.3)
-    assert several < 0.8 * one
-
-
-def test_a_mean_is_worth_as_many_views_as_gave_it_their_points() -> None:
-    place, view = np.array([0, 0, 1, 1, 3]), np.array([0, 1, 0, 1, 0])
-    shares = Shares(place, view, np.zeros(5), np.array([4, 4, 9, 1, 5]))
-    assert shares.seen_by(4) == pytest.approx([2.0, 100.0 / 82.0, 1.0, 1.0])
 
 
 def test_a_range_image_is_one_view_however_many_places_its_sensor_passed() -> None:
