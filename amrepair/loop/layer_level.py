@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
 from amrepair.arrays import Box, Points, Values
-from amrepair.observe.robust import MAD_TO_SIGMA
+from amrepair.observe.robust import sigma_by_median
 from amrepair.policy import DEFAULT_POLICY
 from amrepair.repair import RepairPlan
 
@@ -105,8 +105,8 @@ class LayerLevel:
         many = count >= options.least_points
         if many.sum() < options.least_patches:
             return None
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(mean[many] - np.median(mean[many]))))
-        return cls(cell[many], mean[many], spread, layer_mm, options)
+        spread_mm = sigma_by_median(mean[many])
+        return cls(cell[many], mean[many], spread_mm, layer_mm, options)
 
     def is_off(self, box_mm: Box) -> bool:
         """Whether the layer lies off over a box by more than tolerance and scatter explain."""

@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 from amrepair.arrays import Points, Values
 from amrepair.frames import unit_vectors
 from amrepair.loop.looks import Look, Stop
-from amrepair.observe.robust import MAD_TO_SIGMA
+from amrepair.observe.robust import sigma_by_median
 from amrepair.regions import Label
 from amrepair.repair import RepairPlan
 from amrepair.repair.plan import CoveredLayers
@@ -318,7 +318,7 @@ def _clearest(
 def _sigma_mm(sound_mm: Float[np.ndarray, " s"], layers: int, options: ThinLayersOptions) -> float:
     """Standard deviation of how far so many sound layers stand in against those around them."""
     freedom = len(sound_mm) - 1 + options.known_layers
-    seen_mm = MAD_TO_SIGMA * float(np.median(np.abs(sound_mm - np.median(sound_mm))))
+    seen_mm = sigma_by_median(sound_mm)
     known = options.known_layers * options.known_mm**2
     spread_mm = np.sqrt(((len(sound_mm) - 1) * seen_mm**2 + known) / freedom)
     return float(spread_mm * np.sqrt(1.0 / layers + 1.0 / len(sound_mm)))

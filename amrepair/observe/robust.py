@@ -152,6 +152,11 @@ def _cost(problem: Problem, unknown: Values, width_mm: float) -> float:
     return float(problem.share @ loss + unknown @ unknown)
 
 
+def sigma_by_median(values: Values) -> float:
+    """The standard deviation of Gaussian values, by the median of how far off theirs they are."""
+    return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
+
+
 def biweight(residual_mm: Values, width_mm: float) -> Values:
     """Tukey's weight: 1 at zero, 0 from `width_mm` on."""
     return np.maximum(1 - (residual_mm / width_mm) ** 2, 0.0) ** 2

@@ -41,7 +41,7 @@ class CoveredLayers:
         which = (
             f"layer {self.first} lacks"
             if self.first == self.last
-            else (f"layers {self.first} to {self.last} lack")
+            else f"layers {self.first} to {self.last} lack"
         )
         return (
             f"{which} about {100.0 * self.lacking_ratio:.0f} % of the plastic, by how far their "
