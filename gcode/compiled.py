@@ -42,13 +42,17 @@ from pathlib import Path
 from typing import Any, cast
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when the first of its threads starts
+# numba words and paints every reason why a function of its own does not fit, and shows few of them
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import numba
 import numba.np.linalg
 import numpy as np
+from llvmlite.binding import ffi
 from numba import get_num_threads, prange, set_num_threads, types
 from numba.core import bytecode, event
 from numba.core.runtime import nrt, nrtdynmod
+from numba.core.targetconfig import TargetConfig
 from numba.extending import overload
 from numba.np import arrayobj
 
@@ -129,6 +133,30 @@ def shapes_unsaid() -> None:
     arrayobj.raise_with_shape_context = differ
 
 
+def options_at_once() -> None:
+    """Options of how a kernel is compiled, compared as a whole.
+
+    numba looks up which of its functions a call means by these options, and asks for each of some
+    twenty by its name: a tenth of the time that compiling takes.
+    """
+
+    def values(self: Any) -> dict[str, Any]:
+        return {name: option.default for name, option in self.options.items()} | self._values
+
+    if hasattr(TargetConfig, "values") and "_values" in getattr(TargetConfig, "__slots__", ()):
+        cast(Any, TargetConfig).values = values
+
+
+def lock_untold() -> None:
+    """Make no event of every call into LLVM: half a million in a process that compiles all.
+
+    They tell who measures how long others wait for it, and nobody does.
+    """
+    lock: Any = getattr(ffi.lib, "_lock", None)
+    if isinstance(getattr(lock, "_cblist", None), list):
+        lock._cblist.clear()
+
+
 class _WithoutCollector(event.Listener):
     """Holds Python's collector of circles while a kernel is compiled.
 
@@ -170,6 +198,8 @@ runtime_when_asked()
 _without_collector = _WithoutCollector()
 cast(Any, event).register("numba:compile", _without_collector)
 shapes_unsaid()
+options_at_once()
+lock_untold()
 
 
 def all_from_disk() -> bool:

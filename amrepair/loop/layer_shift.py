@@ -228,7 +228,11 @@ class _Seen:
     def some(self, most: int) -> _Seen:
         """With fewer points, evenly."""
         every = max(1, -(-len(self.place_mm) // most))
-        return replace(self, place_mm=self.place_mm[::every], walls=self.walls.some(every))
+        return replace(
+            self,
+            place_mm=np.ascontiguousarray(self.place_mm[::every]),
+            walls=self.walls.some(every),
+        )
 
     def cut_mm(self, layer: int) -> float:
         return float(0.5 * (self.tops_mm[layer] + self.tops_mm[layer - 1]))

@@ -97,7 +97,10 @@ def assert_made_up(plan: PatchPlan, verdict: Verdict) -> None:
     assert 0.89 <= filled <= 1.015
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [*list(CASES)[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in list(CASES)[3:])],
+)
 def test_what_is_laid_and_what_is_left_out_make_up_what_is_missing(name: str) -> None:
     assert_made_up(*patched(*CASES[name]))
 

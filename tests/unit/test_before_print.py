@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import struct
 import xml.etree.ElementTree as ET
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import manifold3d as m3
@@ -213,23 +215,20 @@ def test_the_place_of_a_contact_is_where_it_is() -> None:
     assert verdict.contact.place_mm[1:] == pytest.approx((105.0, 5.7))
 
 
-def without_skirt() -> str:
+@cache
+def plain_job() -> str:
+    """Without a skirt."""
     box = m3.Manifold.cube((SIDE_MM, SIDE_MM, 1.2)).translate((109.0, 99.0, 0.0))
     process = NO_SKIRT.process.model_copy(update={"skirt_loops": 0})
-    from dataclasses import replace
-
     setup = replace(NO_SKIRT, process=process)
     return write(slice_part(box, setup), setup, title="box").text
 
 
-PLAIN_JOB = without_skirt()
-
-
 def test_a_job_is_raised_onto_what_stands_there() -> None:
     field = scanned.from_points(POINTS, 0.2, what="scan")
-    made = print_onto(Program(PLAIN_JOB, "prusa"), SETUP, field, title="box")
+    made = print_onto(Program(plain_job(), "prusa"), SETUP, field, title="box")
     assert made.raised_mm == pytest.approx(TOP_MM)
-    before = job_for(PLAIN_JOB, SETUP.printer).beads
+    before = job_for(plain_job(), SETUP.printer).beads
     after = job_for(made.checked.program.text, SETUP.printer).beads
     of_job = after.start_mm[:, 2] > TOP_MM + 0.01  # what primes lies on the bed
     own = before.layer >= 0
@@ -247,11 +246,11 @@ def test_homing_x_at_a_jobs_end_changes_no_height() -> None:
     """regression: PrusaSlicer's own default job ends so, and could be raised onto nothing."""
     field = scanned.from_points(POINTS, 0.2, what="scan")
     ends = "G28 X0  ; home X axis\nM84\n"
-    made = print_onto(Program(PLAIN_JOB + ends, "prusa"), SETUP, field)
+    made = print_onto(Program(plain_job() + ends, "prusa"), SETUP, field)
     assert "\nG28 X0  ; home X axis\nM84\n" in made.checked.program.text
     for homes_z in ("G28", "G28 Z", "G28 X Z0", "G28 W"):
         with pytest.raises(InputError, match="changes what a height means"):
-            print_onto(Program(f"{PLAIN_JOB}{homes_z}\n", "prusa"), SETUP, field)
+            print_onto(Program(f"{plain_job()}{homes_z}\n", "prusa"), SETUP, field)
 
 
 def test_a_skirt_would_hang_in_the_air(job: Path) -> None:
@@ -264,7 +263,7 @@ def test_a_skirt_would_hang_in_the_air(job: Path) -> None:
 def test_nothing_stands_under_the_job() -> None:
     field = HeightField.flat((250.0, 210.0), 1.0)
     with pytest.raises(InputError, match="Nothing stands under"):
-        print_onto(Program(PLAIN_JOB, "prusa"), SETUP, field)
+        print_onto(Program(plain_job(), "prusa"), SETUP, field)
 
 
 def test_the_command_writes_a_job_that_passes_with_the_part(tmp_path: Path) -> None:
@@ -272,7 +271,7 @@ def test_the_command_writes_a_job_that_passes_with_the_part(tmp_path: Path) -> N
     part, job, out = tmp_path / "part.stl", tmp_path / "box.gcode", tmp_path / "onto.gcode"
     vertices = np.array(mesh.vert_properties)[:, :3]
     trimesh.Trimesh(vertices, np.array(mesh.tri_verts).astype(int), process=False).export(part)
-    job.write_text(PLAIN_JOB)
+    job.write_text(plain_job())
     done = CliRunner().invoke(
         app, ["print-onto", str(part), str(job), "-o", str(out), "--printer", "prusa_mk3s"]
     )

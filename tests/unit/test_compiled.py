@@ -214,7 +214,7 @@ def test_what_is_read_alone_is_of_one_type_whoever_may_write_to_it() -> None:
 def test_threads_are_those_that_sleep_while_they_wait() -> None:
     """TBB's spin, beside other processes, and kept one that was done from ending."""
     size = np.ones((1, 2, 2, 2), dtype=np.float32)
-    signs_kernels.spread(size, np.ones(size.shape, dtype=np.int8), 0.5)
+    signs_kernels.spread(size, np.ones(size.shape, dtype=np.int8), np.float32(0.5))
     assert numba.threading_layer() == "omp"
     assert os.environ["OMP_WAIT_POLICY"] == "passive"
 

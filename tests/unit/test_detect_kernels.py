@@ -51,7 +51,7 @@ def test_points_are_moved_onto_the_planes_through_their_neighbours(
     cosine, sine = np.cos(turned), np.sin(turned)
     turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     points = np.concatenate([flat, flat[:, [0, 2, 1]]]) @ turn.T  # two walls that meet
-    index = cKDTree(points).query(points, k=16)[1]
+    index = PlaceTree.of(points).neighbours(16)[1]
     place, normal = faces_kernels.smoothed(points, index, 4, 0.2, 0.08)
     true_place, true_normal = plainly_smoothed(points, index, 4, 0.2, 0.08)
     # a hair of weight may tip an edge's point from one wall's plane to the other's
@@ -67,7 +67,7 @@ def test_a_hollow_is_not_filled_by_the_planes_through_its_points() -> None:
     ways = rng.normal(size=(4000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     points = ways * rng.normal(6.5, 0.03, (4000, 1))
-    index = cKDTree(points).query(points, k=16)[1]
+    index = PlaceTree.of(points).neighbours(16)[1]
     place = faces_kernels.smoothed(points, index, 4, 0.36, 0.2)[0]
     off_mm = np.linalg.norm(place, axis=1) - 6.5
     assert abs(off_mm.mean()) < 0.004  # planes alone: −0.022

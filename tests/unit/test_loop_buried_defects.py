@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import manifold3d as m3
@@ -21,8 +22,9 @@ from amrepair.policy.table import Situation
 from amrepair.report.collect import loop_result
 from gcode.cli.app import app as gcode_app
 from gcode.estimate import estimate
+from gcode.moves import Program
 from gcode.profiles import load_setup
-from gcode.reader import job_for
+from gcode.reader import Job, job_for
 from gcode.resumption import resume_at
 from gcode.slicing.job import plan_part
 from gcode.slicing.patch import PatchRegion
@@ -30,12 +32,15 @@ from gcode.writer import write
 from tests.unit.loop_bench import PLACE_MM, Small, scan_of, solid_mesh
 
 SETUP = load_setup()
-PROGRAM = write(
-    plan_part(m3.Manifold.cube((12.0, 12.0, 4.0)).translate((100.0, 90.0, 0.0)), SETUP).toolpath,
-    SETUP, title="block",
-)  # fmt: skip
-JOB = job_for(PROGRAM, SETUP.printer)
 LAYER_MM = 0.2
+
+
+@cache
+def block() -> tuple[Program, Job]:
+    """A job of a block, as text and as it is read."""
+    part = m3.Manifold.cube((12.0, 12.0, 4.0)).translate((100.0, 90.0, 0.0))
+    program = write(plan_part(part, SETUP).toolpath, SETUP, title="block")
+    return program, job_for(program, SETUP.printer)
 
 
 def piece(low_mm: float, high_mm: float, reached: float) -> PatchRegion:
@@ -43,7 +48,7 @@ def piece(low_mm: float, high_mm: float, reached: float) -> PatchRegion:
 
 
 def stop_after(layer: int) -> Stop:
-    return Stop(layer, JOB.layers[layer].end_line, JOB.layers[layer].z_mm)
+    return Stop(layer, block()[1].layers[layer].end_line, block()[1].layers[layer].z_mm)
 
 
 def test_what_lies_in_the_layer_just_printed_is_not_late() -> None:
@@ -56,26 +61,26 @@ def test_what_lies_in_the_layer_just_printed_is_not_late() -> None:
 @pytest.mark.parametrize("low_mm", [1.9, 2.01, 2.08])
 def test_the_part_is_cut_down_to_below_it_and_resume_at_goes_on_from_there(low_mm: float) -> None:
     stop = stop_after(14)
-    reprint, leave = ways((piece(low_mm, 3.0, 0.25),), JOB, stop, SETUP)
-    layer = JOB.layers[reprint.layer or 0]
+    reprint, leave = ways((piece(low_mm, 3.0, 0.25),), block()[1], stop, SETUP)
+    layer = block()[1].layers[reprint.layer or 0]
     assert layer.z_mm - layer.height_mm <= low_mm + 0.5 * layer.height_mm
     assert reprint.cut_to_mm == pytest.approx(layer.z_mm - layer.height_mm)
-    going_on = resume_at(PROGRAM, SETUP, layer=reprint.layer)
+    going_on = resume_at(block()[0], SETUP, layer=reprint.layer)
     assert going_on.standing.top_mm == pytest.approx(reprint.cut_to_mm, abs=1e-3)
     assert (reprint.filled_mm3, reprint.left_mm3) == (pytest.approx(30.0), 0.0)
     assert (leave.filled_mm3, leave.left_mm3) == (0.0, pytest.approx(30.0))
     # layers printed again, of a solid block
-    again_mm = JOB.layers[14].z_mm - (reprint.cut_to_mm or 0.0)
+    again_mm = block()[1].layers[14].z_mm - (reprint.cut_to_mm or 0.0)
     assert reprint.filament_mm3 == pytest.approx(12.0 * 12.0 * again_mm, rel=0.06)
-    share = again_mm / JOB.layers[-1].z_mm
+    share = again_mm / block()[1].layers[-1].z_mm
     assert reprint.print_time_s == pytest.approx(
-        share * estimate(PROGRAM, SETUP.printer).print_time_s, rel=0.15
+        share * estimate(block()[0], SETUP.printer).print_time_s, rel=0.15
     )
     assert f"--layer {reprint.layer}" in reprint.told
 
 
 def test_below_the_first_layer_nothing_is_cut() -> None:
-    (only,) = ways((piece(0.0, 1.0, 0.5),), JOB, stop_after(14), SETUP)
+    (only,) = ways((piece(0.0, 1.0, 0.5),), block()[1], stop_after(14), SETUP)
     assert only.name == "leave"
 
 

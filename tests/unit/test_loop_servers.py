@@ -89,7 +89,7 @@ def whole(small: Small, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 
 @pytest.mark.parametrize("state", ["never begun", "under way", "over"])
-@pytest.mark.parametrize("kind", ["park", "repair"])
+@pytest.mark.parametrize("kind", ["repair", pytest.param("park", marks=pytest.mark.slow)])
 def test_a_killed_loop_goes_on_over_a_server(
     small: Small,
     whole: tuple[Path, list[str]],

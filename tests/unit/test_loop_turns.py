@@ -197,7 +197,15 @@ def run(made: InTurn, folder: Path, scans: object, stops: tuple[Stop, ...]) -> t
     return report, (folder / "sent.gcode").read_text().splitlines()
 
 
-@pytest.mark.parametrize("broken", [None, "layer-004", "layer-024", "final-2", "layer-044"])
+@pytest.mark.parametrize(
+    "broken",
+    [
+        None,
+        "layer-004",
+        "final-2",
+        *(pytest.param(f"layer-0{k}", marks=pytest.mark.slow) for k in (24, 44)),
+    ],
+)
 def test_a_void_is_filled_in_its_own_object_and_nowhere_else(
     three: InTurn, tmp_path: Path, broken: str | None
 ) -> None:

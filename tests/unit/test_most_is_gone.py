@@ -45,13 +45,13 @@ PARTS = {
 SPACING_MM2 = {"with a sheet across its hole": 0.12, "tall vase": 0.35, "tower": 0.5}
 CASES = [
     ("tall vase", 32.0, True),
-    ("tower", 18.0, True),
-    ("cylinder", 8.0, True),
-    ("with a hollow above", 5.0, True),
+    pytest.param("tower", 18.0, True, marks=pytest.mark.slow),
+    pytest.param("cylinder", 8.0, True, marks=pytest.mark.slow),
+    pytest.param("with a hollow above", 5.0, True, marks=pytest.mark.slow),
     ("with a sheet across its hole", 8.0, True),
     ("block", 2.0, False),
-    ("cylinder", 3.0, False),
-    ("block", 5.0, True),
+    pytest.param("cylinder", 3.0, False, marks=pytest.mark.slow),
+    pytest.param("block", 5.0, True, marks=pytest.mark.slow),
     ("block", 3.0, True),
 ]
 

@@ -166,8 +166,6 @@ def solid_of(name: str) -> tuple[trimesh.Trimesh, m3.Manifold]:
     return mesh, m3.Manifold(m3.Mesh64(vertices, np.array(mesh.faces, dtype=np.uint64)))
 
 
-BRACKET = solid_of("bracket.stl")
-BRACKET_TEMPLATE = MeshSdf.from_mesh(BRACKET[0])
 VIEWS = ((0.4, 0.2, 0.9), (-0.7, 0.3, 0.6), (0.1, -0.8, 0.6))
 
 
@@ -175,19 +173,20 @@ VIEWS = ((0.4, 0.2, 0.9), (-0.7, 0.3, 0.6), (0.1, -0.8, 0.6))
 def test_a_bare_view_of_a_sound_part_tells_nothing_missing(
     view: tuple[float, float, float],
 ) -> None:
-    scan = Scan(seen_from(BRACKET[1], view, seed=0), 0.04, "template")
-    deficit = compute_deficit(scan, BRACKET_TEMPLATE, build_from_template=PLACED)
+    mesh, solid = solid_of("bracket.stl")
+    scan = Scan(seen_from(solid, view, seed=0), 0.04, "template")
+    deficit = compute_deficit(scan, MeshSdf.from_mesh(mesh), build_from_template=PLACED)
     assert deficit.missing_mm3 == 0.0
 
 
 def test_a_cut_in_a_bare_view_with_a_silhouette_is_measured() -> None:
-    mesh, solid = BRACKET
+    mesh, solid = solid_of("bracket.stl")
     corner = np.asarray(mesh.bounds)[1]
     cut = m3.Manifold.cube((10, 10, 6), True).translate(tuple(corner - (5, 5, 1)))
     gone = solid ^ cut
     assert gone.volume() > 20.0
     scan = Scan(seen_from(solid - cut, VIEWS[0], seed=0), 0.04, "template")
-    deficit = compute_deficit(scan, BRACKET_TEMPLATE, build_from_template=PLACED)
+    deficit = compute_deficit(scan, MeshSdf.from_mesh(mesh), build_from_template=PLACED)
     assert deficit.missing_mm3 == pytest.approx(gone.volume(), rel=0.15)
     assert (deficit.missing ^ gone).volume() > 0.85 * gone.volume()
 

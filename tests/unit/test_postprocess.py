@@ -9,6 +9,7 @@ import shutil
 import stat
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import manifold3d as m3
@@ -33,9 +34,14 @@ from tests.commands import call
 SIDE_MM, HIGH_MM, LAYER_MM = 24.0, 4.0, 0.2
 SETUP = load_setup("ender_3", "pla", "standard_0.20")  # sparse infill under five solid layers
 BOX = m3.Manifold.cube((SIDE_MM, SIDE_MM, HIGH_MM)).translate((90.0, 90.0, 0.0))
-JOB = write(slice_part(BOX, SETUP), SETUP, title="box").text
 WIDTH_MM = SETUP.process.line_width_mm
 _XY = re.compile(r"^G[01] .*?X([\d.]+) Y([\d.]+)")
+
+
+@cache
+def job() -> str:
+    """A box that our slicer cut."""
+    return write(slice_part(BOX, SETUP), SETUP, title="box").text
 
 
 def spiral(turns: int = 12) -> str:
@@ -81,9 +87,9 @@ def where(text: str) -> list[tuple[float, float, bool]]:
 
 
 def test_all_but_the_looks_stays_as_it_was() -> None:
-    marked = mark(JOB, "job.gcode", "marlin", LooksAsked(every=4))
+    marked = mark(job(), "job.gcode", "marlin", LooksAsked(every=4))
     assert [place.layer for place in marked.places] == [3, 7, 11, 15, 19]
-    assert without_looks(marked.text, ("M400", "M0")) == without_looks(JOB, ("M400", "M0"))
+    assert without_looks(marked.text, ("M400", "M0")) == without_looks(job(), ("M400", "M0"))
     looks = re.findall(r"^;AMREPAIR_LOOK LAYER=(\d+) Z=(\S+)$", marked.text, re.MULTILINE)
     assert [(int(k), float(z)) for k, z in looks] == [
         (k, pytest.approx(LAYER_MM * (k + 1))) for k in (3, 7, 11, 15, 19)
@@ -91,7 +97,7 @@ def test_all_but_the_looks_stays_as_it_was() -> None:
 
 
 def test_line_ends_and_odd_bytes_stay(tmp_path: Path) -> None:
-    odd = JOB.replace("\n", "\r\n").encode() + b"; \xff\xfe no UTF-8\r\n"
+    odd = job().replace("\n", "\r\n").encode() + b"; \xff\xfe no UTF-8\r\n"
     file = tmp_path / "job.gcode"
     file.write_bytes(odd)
     file.chmod(0o640)
@@ -106,7 +112,7 @@ def test_line_ends_and_odd_bytes_stay(tmp_path: Path) -> None:
 
 
 def test_looks_are_off_the_outer_walls_with_the_plastic_pulled_back() -> None:
-    marked = mark(JOB, "job.gcode", "klipper", LooksAsked(every=2, final=False))
+    marked = mark(job(), "job.gcode", "klipper", LooksAsked(every=2, final=False))
     assert marked.on_walls == 0
     for x_mm, y_mm, pulled in where(marked.text):
         # the middle of the outer bead lies half a bead within the box
@@ -124,7 +130,7 @@ def test_nothing_is_marked_in_a_spiral() -> None:
 
 
 def test_adaptive_looks_come_before_what_closes_the_infill() -> None:
-    marked = mark(JOB, "job.gcode", "klipper", LooksAsked(adaptive=True, final=False))
+    marked = mark(job(), "job.gcode", "klipper", LooksAsked(adaptive=True, final=False))
     layers = round(HIGH_MM / LAYER_MM)
     first_top = layers - SETUP.process.top_layers
     assert first_top - 1 in {place.layer for place in marked.places}
@@ -134,14 +140,14 @@ def test_adaptive_looks_come_before_what_closes_the_infill() -> None:
 
 
 def test_a_height_is_looked_at_when_it_is_reached() -> None:
-    marked = mark(JOB, "job.gcode", "reprap", LooksAsked(at_z_mm=(1.05,), final=False))
+    marked = mark(job(), "job.gcode", "reprap", LooksAsked(at_z_mm=(1.05,), final=False))
     assert [place.z_mm for place in marked.places] == [pytest.approx(1.2)]
     with pytest.raises(InputError, match="no layer at z = 9 mm"):
-        mark(JOB, "job.gcode", "reprap", LooksAsked(at_z_mm=(9.0,)))
+        mark(job(), "job.gcode", "reprap", LooksAsked(at_z_mm=(9.0,)))
 
 
 def test_a_job_is_marked_once() -> None:
-    once = mark(JOB, "job.gcode", "marlin", LooksAsked(every=4)).text
+    once = mark(job(), "job.gcode", "marlin", LooksAsked(every=4)).text
     again = mark(once, "job.gcode", "marlin", LooksAsked(every=3))
     assert again.text == once
     assert again.marked_before
@@ -177,19 +183,19 @@ def test_what_is_for_a_host_is_not_sent() -> None:
     ],
 )
 def test_the_slicers_environment_says_who_reads(environment: dict[str, str], target: str) -> None:
-    assert target_of(JOB, "job.gcode", environment) == target
+    assert target_of(job(), "job.gcode", environment) == target
 
 
 def test_a_prusas_own_pause_is_chosen_by_the_jobs_settings() -> None:
     keys = {"printer_model": "MK4", "gcode_flavor": "marlin2", "layer_height": "0.2"}
     block = "".join(f"; {key} = {value}\n" for key, value in keys.items())
-    text = f"{JOB}\n; prusaslicer_config = begin\n{block}; prusaslicer_config = end\n"
+    text = f"{job()}\n; prusaslicer_config = begin\n{block}; prusaslicer_config = end\n"
     assert target_of(text, "job.gcode", {"SLIC3R_GCODE_FLAVOR": "marlin2"}) == "prusa"
 
 
 def test_nobody_tells_who_reads() -> None:
     with pytest.raises(InputError, match="say it by --for"):
-        target_of(JOB, "job.gcode", {})
+        target_of(job(), "job.gcode", {})
 
 
 @pytest.mark.parametrize(
@@ -213,10 +219,10 @@ def test_a_failure_leaves_the_job_and_ends_with_one_line(tmp_path: Path) -> None
 
 
 def test_a_command_of_ones_own() -> None:
-    marked = mark(JOB, "job.gcode", "marlin", LooksAsked(every=10, command="M117 z {z}\\nM600"))
+    marked = mark(job(), "job.gcode", "marlin", LooksAsked(every=10, command="M117 z {z}\\nM600"))
     assert "\nM117 z 2.000\nM600\n" in marked.text
     with pytest.raises(InputError, match="may name"):
-        mark(JOB, "job.gcode", "marlin", LooksAsked(every=10, command="M117 {height}"))
+        mark(job(), "job.gcode", "marlin", LooksAsked(every=10, command="M117 {height}"))
 
 
 PRUSA_SLICER = shutil.which("prusa-slicer")
