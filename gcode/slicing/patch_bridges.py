@@ -149,12 +149,13 @@ class Holds:
         self._air = ~self._held & ~lies
         # there a thin strand hangs over a floor that a thick one would lie on
         self._gap, self._over_floor = gap, model.near & below & (gap > at.most_mm)
-        self._firm = ~self._over_floor
+        hangs = self._over_floor | asked  # what is deeper still holds no strand either
+        self._firm = ~hangs
         if self._over_floor.any():
             under = (gap <= at.most_mm) & ~state.loose
             high = gap <= model.options.bridges.beside_layers * at.layer_mm
             for holds, near_mm in ((under, 0.5 * model.line_width_mm), (high, within_mm)):
-                self._firm |= beside(holds, self._over_floor, near_mm, model.cell_mm)
+                self._firm |= beside(holds, hangs, near_mm, model.cell_mm)
 
     def floored(
         self, runs: list[Bead], thick: Float[np.ndarray, "ny nx"]

@@ -8,8 +8,10 @@ import manifold3d as m3
 import numpy as np
 import pytest
 
+from gcode.moves import Role
 from gcode.profiles import PrintSetup, load_setup
 from gcode.progress import silent
+from gcode.slicing.beads import Bead
 from gcode.slicing.layers import LayerGrid
 from gcode.slicing.options import DEFAULT_PATCH
 from gcode.slicing.patch_bridges import Holds
@@ -68,6 +70,29 @@ def test_what_hangs_at_a_height_holds_nothing_laid_at_the_same(model: PatchModel
     assert Holds(model, state, at, 0.8).stretches(across_mm) == []
     lower = replace(state, hung_mm=np.where(left, at.z_mm - 0.2, begun.hung_mm))
     assert Holds(model, lower, at, 0.8).stretches(across_mm) != []
+
+
+@pytest.mark.parametrize(("begins_mm", "held"), [(0.2, True), (3.0, False)])
+def test_what_begins_over_a_deep_place_droops_onto_a_floor_near_below(
+    model: PatchModel, begins_mm: float, held: bool
+) -> None:
+    # regression: columns deeper than a bead gets counted as firm, so that a strand which began over
+    # one was left thin, and lay a layer too low (a late find in sparse lines: 0.78 filled for 0.81)
+    heights = Heights.of(model, GRID, SETUP, openings=Openings.EACH)
+    begun = PatchState.begun(model)
+    at = heights.at(len(heights.all_mm) - 1, begun, model)
+    floor_mm = 0.5 * (at.most_mm + at.deep_mm)  # a thin strand hangs, a thick one lies
+    middle_mm = model.origin_mm + 0.5 * model.cell_mm * np.array(model.shape[::-1])
+    x_mm = (model.points_mm[:, 0] - middle_mm[0]).reshape(model.shape)
+    under_mm = np.where(x_mm < -1.5, begins_mm, np.where(x_mm > 1.5, 0.2, floor_mm))
+    holds = Holds(model, replace(begun, surface_mm=at.z_mm - under_mm), at, 0.5)
+    line = Bead(
+        middle_mm + np.linspace(-2.5, 2.5, 26)[:, None] * np.array([1.0, 0.0]),
+        np.full(25, 0.45), Role.SOLID_INFILL, closed=False,
+    )  # fmt: skip
+    thick = holds.floored([line], np.where(np.abs(x_mm) < 1.5, 0.2, 0.0))
+    over = model.at(thick, middle_mm + np.array([[-0.8, 0.0], [0.0, 0.0], [0.8, 0.0]]), np.nan)
+    np.testing.assert_allclose(over, 0.2 if held else floor_mm)
 
 
 def test_over_what_nothing_stands_beside_no_opening_is_looked_for() -> None:
