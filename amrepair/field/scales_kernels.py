@@ -166,6 +166,17 @@ def window_means(table, count, value):
 
 
 @njit(cache=True, nogil=True, parallel=True)
+def window_sums(table, count, value):
+    """(s, v) sums over each window of v values a cell."""
+    out = np.zeros((table.shape[0], value.shape[1]))
+    for i in prange(table.shape[0]):
+        for k in range(count[i]):
+            for c in range(value.shape[1]):
+                out[i, c] += value[table[i, k], c]
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
 def window_medians(table, count, value):
     """(s,) median over each window of the values that are numbers; NaN where none is."""
     n = table.shape[0]

@@ -117,16 +117,19 @@ def _levels(
         tolerance_mm=tolerance_mm,
         correlation_mm=options.correlation_mm,
     )
+    removed_mm = found.removed_mm(surfels.place_mm, normal, None)
+    shares = None if bed.view_index is None else surfels.by_view(bed.view_index)
     inspected = Inspected(
         cells=n,
         cell_mm=surfels.cell_mm,
         place_mm=surfels.place_mm,
         normal=normal,
-        value_mm=surfels.deviation_mm - found.removed_mm(surfels.place_mm, normal, None),
+        value_mm=surfels.deviation_mm - removed_mm,
         weight=surfels.count.astype(np.float64),
         tolerance_mm=np.full((2, n), tolerance_mm),
         facing=incidence(normal, surfels.toward_sensors(np.arange(n))),
         pose_mm=np.zeros(n),
+        shares=shares and replace(shares, value_mm=shares.value_mm - removed_mm[shares.place]),
     )
     return tested(
         inspected, replace(options, process_sigma_mm=0.0, most_windows=options.bed_windows), None

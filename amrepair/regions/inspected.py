@@ -13,6 +13,7 @@ from amrepair.field.near import nearest_within
 from amrepair.frames import diagonal
 from amrepair.observe.background import ON_PLANE_MM
 from amrepair.observe.incidence import incidence
+from amrepair.observe.views import Shares
 from amrepair.regions.observation import PRESENT_CELLS, Observed
 from amrepair.regions.options import RegionOptions
 from amrepair.template.learned import TOLERATED_SPREADS
@@ -51,9 +52,13 @@ class Inspected:
         (b,) cosine of the angle of incidence.
     pose_mm
         (b,) standard error that neighbouring places share: from the pose, the size and the bow of
-        the part, from views that disagree, and from where in a pixel its ray passed.
+        the part, from views that disagree (where the pose was fitted), and from where in a pixel
+        its ray passed.
     ends
         How many of the places, the last ones, are ends of walls.
+    shares
+        What each view says of each cell; None where views are not told apart, or where what they
+        disagree by is in `pose_mm`.
     """
 
     cells: int
@@ -66,6 +71,7 @@ class Inspected:
     facing: Values
     pose_mm: Values
     ends: int = 0
+    shares: Shares | None = None
 
     @property
     def apart(self) -> Mask:
@@ -127,6 +133,7 @@ def inspected_of(
         facing=np.append(facing, np.full(others, usual_facing)),
         pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm, np.zeros(len(ends))]),
         ends=len(ends),
+        shares=seen.shares,
     )
 
 

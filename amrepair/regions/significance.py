@@ -8,7 +8,8 @@ The standard error of a mean comes from the scan itself and has two parts. One i
 cell to cell, and neighbouring cells tell it by their differences. The other is common to a whole
 window, the wander, and windows far apart tell it by theirs, less what the process is known to
 leave. Only few places are so far apart that their errors are independent, so a deviation divided by
-this standard error is distributed as Student's t rather than normally.
+this standard error is distributed as Student's t rather than normally. Where several views saw a
+window they tell its common part, too, by how much they differ (`between_views`).
 
 Real scanners leave more outliers than that. Where more places exceed the tolerance than can be
 real, their peaks tell the tail of the errors (Efron 2004, by peaks over a threshold); what stands
@@ -29,6 +30,7 @@ from amrepair.field import scales_kernels
 from amrepair.field.groups import cell_numbers, connected
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.frames import cells_of
+from amrepair.regions.between_views import Said, ViewErrors
 from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.inspected import Inspected
 from amrepair.regions.options import RegionOptions
@@ -251,6 +253,7 @@ def tested(
         widest_mm=options.widest_mm,
         apart=inspected.apart,
     )
+    said = Said.of(inspected)
     share = options.false_regions / (2 * (len(scales) + 1))
     levels = []
     for k, scale in enumerate(scales):
@@ -264,14 +267,16 @@ def tested(
         )
         group = seen_class(scale, faced, options.seen_step)
         most_mm = options.most_wander * point_sigma_mm(scales[0])
-        errors = _errors(scale, group, faced, pose, options, calibration, most_mm)
+        views = ViewErrors.of(scale, said)
+        by_cells, by_means = _errors(
+            scale, group, faced, pose, views, options, calibration, most_mm
+        )
+        allowed_mm = np.stack(delta)
         means = np.stack([-scale.median_mm, scale.median_mm])
         thirds = np.stack([-scale.low_mm, scale.high_mm])
-        for statistic, sides in ((0, thirds), (1, means))[0 if k == 0 else 1 :]:
+        for statistic, sides, errors in ((0, thirds, by_cells), (1, means, by_means))[k > 0 :]:
             levels.append(
-                _level(
-                    scale, sides, np.stack(delta), errors, share, options, calibration, statistic
-                )
+                _level(scale, sides, allowed_mm, errors, share, options, calibration, statistic)
             )
     return tuple(levels)
 
@@ -286,11 +291,17 @@ def _errors(
     group: Numbers,
     facing: Values,
     pose_mm: Values,
+    views: ViewErrors,
     options: RegionOptions,
     calibration: Calibration | None,
     most_mm: float,
-) -> Errors:
-    """The standard errors of a scale: independent from cell to cell, and common to windows."""
+) -> tuple[Errors, Errors]:
+    """The standard errors of a scale, of its cells and of its windows' medians.
+
+    They are independent from cell to cell, and common to windows. Windows far apart tell what they
+    have in common, and so do views of the same window, which are right too where fewer of them saw
+    a place; they tell of the same errors, and the larger counts.
+    """
     classes = int(group.max()) + 1
     # a cell whose few neighbours happen to agree is as noisy as others that were seen as well
     usual = by_class(group, scale.noise_mm, options)[group]
@@ -302,11 +313,15 @@ def _errors(
         wander, freedom = calibration.wander(scale.width_mm, classes)
     # the calibration has seen nothing so far aslant: there errors grow
     aslant = 1.0 if calibration is None else np.maximum(calibration.facing / facing, 1.0)
-    explained = options.process_sigma_mm**2 + window**2
-    common = np.sqrt(np.maximum((wander[group] * aslant) ** 2 - explained, 0.0) + pose_mm**2)
     few = min(options.least_cells, len(facing)) - 1
     least = float(np.partition(facing, few)[few])
-    return Errors(cell, window, common, wander, freedom, group, least)
+    by_wander = (wander[group] * aslant) ** 2 - options.process_sigma_mm**2
+    found = []
+    for seen_by in (views.cell_by, views.window_by):
+        errs = np.maximum(by_wander, views.one_mm**2 / seen_by) - window**2
+        common = np.sqrt(np.maximum(errs, 0.0) + pose_mm**2)
+        found.append(Errors(cell, window, common, wander, freedom, group, least))
+    return found[0], found[1]
 
 
 def seen_class(scale: Scale, facing: Values, step: float) -> Numbers:

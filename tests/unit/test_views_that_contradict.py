@@ -8,6 +8,7 @@ import pytest
 from amrepair.observe.incidence import incidence
 from amrepair.observe.rays import MIN_COSINE
 from amrepair.regions import detect
+from amrepair.regions.error_calibration import NORMAL_NOISE
 from amrepair.scans import RangeGrid, Scan
 from tests.analytic import AnalyticTemplate, sample_surface, sphere
 
@@ -20,9 +21,18 @@ def ball() -> AnalyticTemplate:
 
 
 def views(
-    ball: AnalyticTemplate, seed: int, count: int = VIEWS, *, off_mm: float = 0.0, of: int = 0
+    ball: AnalyticTemplate,
+    seed: int,
+    count: int = VIEWS,
+    *,
+    off_mm: float = 0.0,
+    of: int = 0,
+    wave_mm: float = 0.0,
 ) -> Scan:
-    """Views from all around, each of its half; one of them lies aside by so much, along x."""
+    """Views from all around, each of its half; one of them lies aside by so much, along x.
+
+    Each errs on its own by three waves, so many millimetres high, which hang together over 6 mm.
+    """
     rng = np.random.default_rng(seed)
     clouds, ways = [], []
     for k in range(count):
@@ -31,6 +41,9 @@ def views(
         points, normals = sample_surface(ball.body, 0.5, seed=10 * seed + k)
         seen = normals @ way > 0.1
         noise = rng.normal(scale=0.03, size=(int(seen.sum()), 1))
+        if wave_mm:
+            waves = np.sin(2 * np.pi * points[seen] / 12.0 + rng.uniform(0.0, 2 * np.pi, 3))
+            noise += wave_mm * waves.sum(axis=1, keepdims=True)
         shift = np.array([off_mm if k == of else 0.0, 0.0, 0.0])
         clouds.append(points[seen] + noise * normals[seen] + shift)
         ways.append(200.0 * way)
@@ -72,6 +85,17 @@ def test_a_dent_that_several_views_see_is_no_contradiction(ball: AnalyticTemplat
     found = detect(Scan(points, 0.04, "template", None, scan.sensors_mm, scan.sensor_index), ball)
     assert found.contradicting == ()
     assert [region.label.name for region in found.regions] == ["MISSING"]
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_where_the_pose_is_told_views_that_err_on_their_own_are_no_defect(
+    ball: AnalyticTemplate, seed: int
+) -> None:
+    # regression: of a layer, what views disagree by was left out of its error
+    scan = views(ball, seed, wave_mm=0.08)  # two false regions, before it counted
+    found = detect(scan, ball, pose="told", calibration=NORMAL_NOISE)
+    assert found.regions == ()
+    assert found.calibration == NORMAL_NOISE
 
 
 def test_a_range_image_is_one_view_however_many_places_its_sensor_passed() -> None:
