@@ -12,7 +12,7 @@ From a scan file to checked G-code:
 >>> if plan.checked is not None:
 ...     written = Path("repair.gcode").write_text(plan.checked.program.text)
 >>> print(f"{plan.deficit.missing_mm3:.0f} mm³ missing in {len(plan.to_fill)} region")
-89 mm³ missing in 1 region
+90 mm³ missing in 1 region
 
 The names below are all there is to learn for that; they are loaded when first used, so that
 importing this package costs nothing. Each room (`amrepair.scans`, `amrepair.align`, …) has more.

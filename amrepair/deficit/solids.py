@@ -19,7 +19,7 @@ from gcode.progress import Progress
 
 # A corner of a cube of side τ lies √3 τ from the eroded template.
 GROW_FACTOR = 3**0.5
-# So that none of its cubes' corners on the template's surface is left out.
+# So that none of its cubes' corners on the template's surface is left out, at √3 samples at most.
 SAMPLES_BEYOND = 2.0
 # Farther than anything that is asked for.
 FAR_MM = 10.0
@@ -90,12 +90,26 @@ def _solids_in_box(sought: Sought, place: Box) -> list[manifold3d.Manifold]:
     else:
         core = _of_a_region(core, box, sought.told_mm(inside), s.cell_mm)
     field = _grown_back(sought, box, core & ~line, core & line, clip, f)
-    options = sought.options.voxels
-    if box.step_mm.max() <= options.coarsest_mm:
-        return solids_from_field(box, field, options.crumb_mm3)
     sure = (cautious > limit_mm / 2).reshape(box.shape)
-    beyond = _beyond_the_surface(field, (sought.sign * f > 0).reshape(box.shape), sure)
-    return cut_to_design(sought, solids_from_field(box, beyond, options.crumb_mm3))
+    return _cut_out(sought, box, field, f, sure, by_mesh=not np.isfinite(finest_mm))
+
+
+def _cut_out(
+    sought: Sought, box: VoxelBox, field: Voxels, f_mm: Values, sure: VoxelMask, *, by_mesh: bool
+) -> list[manifold3d.Manifold]:
+    """Where the field is negative, as far as the template's surface.
+
+    Of what is missing of a part that a mesh tells, and where samples lie far apart, the template's
+    own solid cuts it there.
+    """
+    options = sought.options.voxels
+    breaks, coarse = by_mesh and not sought.is_excess, box.step_mm.max() > options.coarsest_mm
+    if breaks:
+        field = _by_broken_planes(sought, box, field, f_mm, sure & (field < 0))
+    if coarse:
+        field = _beyond_the_surface(field, (sought.sign * f_mm > 0).reshape(box.shape), sure)
+    pieces = solids_from_field(box, field, options.crumb_mm3)
+    return cut_to_design(sought, pieces) if breaks or coarse else pieces
 
 
 def _shown(
@@ -162,6 +176,27 @@ def _grown_back(
     # what is enclosed in mid-air is nothing that stands: there it is as designed
     enclosed = ndimage.binary_fill_holes(field < 0) & (field >= 0)
     return np.where(enclosed, sought.sign * -f_mm.reshape(box.shape), field)
+
+
+def _by_broken_planes(
+    sought: Sought, box: VoxelBox, field: Voxels, f_mm: Values, sure: VoxelMask
+) -> Voxels:
+    """Around what surely differs: how far samples lie from the broken surface alone.
+
+    Distances that end at the template's surface as well round off where a break runs out, and where
+    it does so at an acute angle a fin that is not there is left of the part. The broken surface's
+    planes go on beyond the template's, whose own solid then cuts them.
+    """
+    if not sure.any():
+        return field
+    near = ndimage.distance_transform_edt(~sure) <= SAMPLES_BEYOND
+    near &= np.abs(f_mm).reshape(box.shape) <= SAMPLES_BEYOND * float(box.step_mm.max())
+    asked = np.flatnonzero(near)
+    told = -sought.evidence.broken_clearance(box.samples_mm()[asked], f_mm[asked])
+    flat, own = field.ravel().copy(), f_mm[asked] < 0
+    known = np.isfinite(told) & (~own | (told * flat[asked] > 0))
+    flat[asked[known]] = told[known]
+    return flat.reshape(box.shape)
 
 
 def _beyond_the_surface(field: Voxels, own: VoxelMask, sure: VoxelMask) -> Voxels:

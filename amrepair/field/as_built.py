@@ -113,6 +113,26 @@ class Evidence:
         sharp[ask[known]] = np.clip(surface, low, high)[known]
         return sharp
 
+    def broken_clearance(self, points_mm: Points, f_mm: Values) -> Values:
+        """How far points lie above the nearest broken surface, whose planes go on beyond its rim.
+
+        NaN where none lies over or under the point.
+        """
+        s, options = self.surfels, self.options.faces
+        planes, spacing_mm = (
+            SurfacePlanes(s.place_mm, s.deviation_mm, self.off, self.normal, s.tree),
+            s.cell_mm,
+        )
+        if self.faces is not None:
+            planes, spacing_mm = self.faces.planes, self.faces.spacing_mm
+        if not planes.off.any():
+            return np.full(len(points_mm), np.nan)
+        near = planes.broken.nearest(points_mm, f_mm, options.neighbours, 2 * spacing_mm)
+        beside_mm = (
+            options.beside_spacings * spacing_mm + options.beside_per_height * near.height_mm
+        )
+        return np.where(near.sideways_mm > beside_mm, np.nan, near.value_mm)
+
     def surface_clearance(self, points_mm: Points, f_mm: Values) -> Values:
         """Signed distance to the scanned surface itself (no rays), positive outside."""
         s, options = self.surfels, self.options

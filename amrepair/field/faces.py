@@ -67,6 +67,15 @@ class SurfacePlanes:
     normal: Points
     tree: PlaceTree
 
+    @property
+    def broken(self) -> SurfacePlanes:
+        """Those of them that are none of the template's surface."""
+        place_mm = self.place_mm[self.off]
+        return SurfacePlanes(
+            place_mm, self.deviation_mm[self.off], self.off[self.off], self.normal[self.off],
+            PlaceTree.of(place_mm),
+        )  # fmt: skip
+
     def nearest(
         self,
         points_mm: Float[np.ndarray, "m 3"],

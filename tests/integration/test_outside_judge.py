@@ -98,10 +98,8 @@ def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
     plan = plan_repair(_scan(rest, 1), site, title=name, guess=placed.inverse())
     assert plan.checked is not None
     assert plan.patch is not None
-    # the deficit, against the truth; of a wall 1.2 mm thick the broken edge is six points wide, and
-    # planes through them and the wall's own faces round it off: 36.2 of 38.4 mm³
-    most_off = 0.06 if name == "wall gap" else 0.05
-    assert plan.deficit.missing_mm3 == pytest.approx(piece.volume(), rel=most_off)
+    # regression: distances to the part's own faces rounded breaks off, 36.2 of the gap's 38.4 mm³
+    assert plan.deficit.missing_mm3 == pytest.approx(piece.volume(), rel=0.02)
     verdict = judge(
         plan.checked.program.text,
         _mesh(rest),
@@ -109,7 +107,8 @@ def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
         np.asarray(piece.bounding_box()).reshape(2, 3),
     )
     assert verdict.filled_ratio >= least_filled
-    assert verdict.outside_ratio <= 0.05
+    # of a wall 1.2 mm thick the round sides of its lines lie 0.02 mm beyond either face
+    assert verdict.outside_ratio <= (0.06 if name == "wall gap" else 0.05)
     assert verdict.in_air_mm3 <= 0.005 * verdict.laid_mm3 + 0.1
     assert verdict.widest_mm <= 2 * setup.printer.nozzle_diameter_mm + 1e-9
     assert verdict.deepest_contact_mm <= 0.2
@@ -171,7 +170,8 @@ def test_what_the_head_alone_allows_is_filled_where_a_floor_is_near(
     box = np.asarray(piece.bounding_box()).reshape(2, 3)
     verdict = judge(program.text, _mesh(rest), _mesh(block), box, head=HEADS[printer])
     assert verdict.filled_open_ratio >= least
-    assert verdict.outside_ratio <= 0.05
+    # of a wall 1.2 mm thick the round sides of its lines lie 0.02 mm beyond either face
+    assert verdict.outside_ratio <= (0.06 if name == "wall gap" else 0.05)
     assert verdict.in_air_mm3 <= 0.005 * verdict.laid_mm3 + 0.1
     assert verdict.deepest_contact_mm <= 0.2
     assert plan.reachable_mm3 / piece.volume() == pytest.approx(verdict.open_ratio, abs=0.05)
