@@ -118,11 +118,7 @@ class Evidence:
 
         NaN where none lies over or under the point.
         """
-        s, options = self.surfels, self.options.faces
-        planes, spacing_mm = (
-            SurfacePlanes(s.place_mm, s.deviation_mm, self.off, self.normal, s.tree),
-            s.cell_mm,
-        )
+        options, planes, spacing_mm = self.options.faces, self._planes, self.surfels.cell_mm
         if self.faces is not None:
             planes, spacing_mm = self.faces.planes, self.faces.spacing_mm
         if not planes.off.any():
@@ -133,11 +129,15 @@ class Evidence:
         )
         return np.where(near.sideways_mm > beside_mm, np.nan, near.value_mm)
 
+    @property
+    def _planes(self) -> SurfacePlanes:
+        s = self.surfels
+        return SurfacePlanes(s.place_mm, s.deviation_mm, self.off, self.normal, s.tree)
+
     def surface_clearance(self, points_mm: Points, f_mm: Values) -> Values:
         """Signed distance to the scanned surface itself (no rays), positive outside."""
         s, options = self.surfels, self.options
-        planes = SurfacePlanes(s.place_mm, s.deviation_mm, self.off, self.normal, s.tree)
-        near = planes.nearest(points_mm, f_mm, options.neighbours, s.cell_mm)
+        near = self._planes.nearest(points_mm, f_mm, options.neighbours, s.cell_mm)
         # beside, not above: the nearest plane does not reach there
         reach_mm = options.sideways_cells * s.cell_mm + options.sideways_per_height * near.height_mm
         beside = self.off[near.index] & (near.sideways_mm > reach_mm)
