@@ -92,13 +92,11 @@ def typed(
     """
     layer_mm = plan.layer_height_mm
     seen = _surfaces(plan, site, options)
-    whole, flow = _came_off(plan, build_from_scanner, options), None
-    if whole is None and seen is not None:
-        found = (
-            _aside(plan, job, line, seen, options),
-            _warped(seen[0], layer_mm, options),
-        )
-        whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
+    found, flow = [_came_off(plan, build_from_scanner, options)], None
+    if seen is not None:
+        # a scan that was laid over the upper layers lies aside of its place, as the lower ones do
+        found += [_aside(plan, job, line, seen, options), _warped(seen[0], layer_mm, options)]
+    whole = max((k for k in found if k is not None), key=lambda k: k.confidence, default=None)
     if whole is None and seen is not None and plan.deficit.regions and not repaired:
         flow = _flow(_laid(plan, job, line, seen[2], options), job, line, layer_mm, options)
     pieces = {

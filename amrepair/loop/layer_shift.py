@@ -5,9 +5,15 @@ from which layer on all beads lie aside, by how much in X and Y; and which share
 those layers should have is there, in any mix of shares over the layer. Unmoved, it explains layers
 that are as planned, thin, or gone; moved, it explains layers that the motors have put elsewhere. Of
 one look both are fitted, and the evidence of the moved one over the best unmoved one is told patch
-by patch, as errors hang together within a patch and not beyond it: its mean over the patches has to
-stand out from its own spread (Vuong's test of models that are not nested, Econometrica 57, 1989,
-with patches for observations), by a quantile that counts how many moves were tried.
+by patch. Errors hang together within a patch and not beyond it, so that a patch is one observation,
+whose log density is the mean of its points'. Two things are asked of the evidence:
+
+- There is enough of it for all the moves that were tried. Were the unmoved model true, a likelihood
+  ratio of e^x would be as rare as e^-x (Markov's inequality; Vovk and Wang, "E-values", Annals of
+  Statistics 49, 2021), however few the patches are that tell it: a slim part has not many.
+- It is told by the patches at large, since neither model is quite true: its mean over the patches
+  stands out from its own spread (Vuong's test of models that are not nested, Econometrica 57, 1989,
+  with patches for observations). What some damage happens to explain is told by a few of them.
 """
 
 from __future__ import annotations
@@ -32,6 +38,9 @@ class ShiftOptions:
     ----------
     false_alarm
         Probability that a look at layers which lie where they should tells a shift.
+    spread_level
+        Probability that patches which speak for neither explanation differ so much to one side:
+        what passes only the other test is told by a few patches, as damage is.
     prior
         Of looks, the share at which layers have shifted: what evidence is held against, for how
         sure a shift is. What is no surer than as sure as not is looked at again.
@@ -72,6 +81,7 @@ class ShiftOptions:
     """
 
     false_alarm: float = 1e-3
+    spread_level: float = 1e-2
     prior: float = 1e-2
     tolerance_mm: float = 0.2
     reach_mm: float = 5.0
@@ -311,10 +321,11 @@ def layer_shift(
     if fits is None or fits[0].size_mm <= options.tolerance_mm:
         return None
     moved, rival = fits
-    gain = np.bincount(patch, moved.log_density - rival.log_density)
+    gain = np.bincount(patch, moved.log_density - rival.log_density) / np.bincount(patch)
     spread = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
-    one_p = float(stdtr(len(gain) - 1, -gain.mean() / spread))
-    p_value = _moves_as_far(seen, moved.size_mm) * one_p
+    if float(stdtr(len(gain) - 1, -gain.mean() / spread)) > options.spread_level:
+        return None
+    p_value = float(_moves_as_far(seen, moved.size_mm) * np.exp(-gain.sum()))
     if p_value > options.false_alarm:
         return None
     x_mm, y_mm = moved.by_mm.tolist()
