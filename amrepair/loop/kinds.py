@@ -220,12 +220,17 @@ def _aside(
             float(np.hypot(walls.noise_mm, options.shift.lateral_mm)),
         ),
         float(np.hypot(walls.noise_mm, beads_mm)), job, line, options.shift,
-        regions=bool(plan.deficit.regions),
+        regions=bool(plan.deficit.regions), between_views_mm=_between_views_mm(plan),
     )  # fmt: skip
     if found is None:
         return None
     spoils = _sure(found.size_mm, options.shift_layers * plan.layer_height_mm)
     return TypeGuess(DefectType.LAYER_SHIFT, min(spoils, found.confidence), found.told())
+
+
+def _between_views_mm(plan: RepairPlan) -> float:
+    noise = plan.anomaly.noise
+    return 0.0 if noise is None else noise.view_disagreement_mm or 0.0
 
 
 def _came_off(

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import stdtr
+from scipy.special import ndtri, stdtr
 
 from amrepair.arrays import Points, Values
 from amrepair.loop import layer_shift_kernels as kernels
@@ -45,7 +45,8 @@ class ShiftOptions:
         Of looks, the share at which layers have shifted: what evidence is held against, for how
         sure a shift is. What is no surer than as sure as not is looked at again.
     tolerance_mm
-        So far aside any layer may lie, half a bead: backlash, registration, views that disagree.
+        So far aside any layer may lie, half a bead: backlash, registration. What views disagree by
+        comes on top.
     reach_mm
         The farthest move that is tried, in X and in Y.
     step_mm, finest_mm
@@ -292,6 +293,7 @@ def layer_shift(
     options: ShiftOptions = DEFAULT_SHIFT,
     *,
     regions: bool = True,
+    between_views_mm: float = 0.0,
 ) -> LayerShift | None:
     """Which layers lie aside of those below, if any do.
 
@@ -308,7 +310,12 @@ def layer_shift(
     regions
         Whether something was found missing or too much. If not, tops are as they should be, and
         only walls can tell.
+    between_views_mm
+        Standard deviation between what views say of one place. Of the upper layers one view may
+        show more, and of the lower ones another.
     """
+    apart_mm = float(ndtri(1.0 - options.false_alarm)) * np.sqrt(2.0) * between_views_mm
+    options = replace(options, tolerance_mm=float(np.hypot(options.tolerance_mm, apart_mm)))
     seen = _seen(place_mm, walls, noise_mm, job, line, options)
     if seen is None:
         return None

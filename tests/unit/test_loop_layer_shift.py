@@ -118,6 +118,16 @@ def test_the_layers_of_a_slim_part_are_told_by_few_patches(by_mm: tuple[float, f
     assert np.abs(np.array(found.by_mm) - by_mm).max() < 0.16
 
 
+def test_layers_are_no_farther_aside_than_views_are(box: tuple[Job, int]) -> None:
+    # regression: of fins seen by a scanner whose views differ by 0.09 mm, as a real one's do, a
+    # shift of 0.3 mm was told
+    job, line = box
+    cloud = seen_from_above(job, whole, lambda layer: np.array([0.35, 0.0]) * (layer >= 14))
+    low = walls_of(lambda place, out: np.zeros(len(out)), high_mm=HIGH_MM * 14 - 0.3)
+    assert layer_shift(cloud, low, NOISE_MM, job, line, between_views_mm=0.02) is not None
+    assert layer_shift(cloud, low, NOISE_MM, job, line, between_views_mm=0.09) is None
+
+
 @pytest.mark.parametrize("share", [0.5, 0.0, 0.8, 1.0])
 @pytest.mark.parametrize("layers", [1, 4])
 def test_layers_that_are_thin_or_gone_are_no_shift(
