@@ -344,7 +344,7 @@ def _say(
     from amrepair.report import plan_is_enough, summary_of_result
     from amrepair.report.text import left_out_lines
 
-    within = plan_is_enough(plan)
+    within = plan_is_enough(plan, late)
     if as_json:
         console.show_json(result)
     else:

@@ -12,7 +12,7 @@ import numpy as np
 
 from amrepair.errors import InputError
 from amrepair.loop.locate import first_layer
-from amrepair.policy import Decision
+from amrepair.policy import Action, Decision
 from amrepair.policy.acceptance import volume_mm3
 from amrepair.policy.stopping_criteria import may_be_left
 from amrepair.regions.error_calibration import Calibration
@@ -147,10 +147,12 @@ def left_well(looks: Sequence[Look], found_mm3: float) -> bool:
     found_mm3
         Volume found missing in the job so far: a later look sees earlier repairs, too.
     """
-    last = looks[-1].plan
-    return last.within_tolerance or may_be_left(
+    last, decision = looks[-1].plan, looks[-1].decision
+    # what is offered to be printed again lies under what was seen: of it no region tells
+    offered_mm3 = decision.situation.buried_mm3 if decision.action is Action.OFFER else 0.0
+    return (last.within_tolerance and not offered_mm3) or may_be_left(
         found_mm3,
-        missing_mm3=volume_mm3(last.to_fill),
+        missing_mm3=max(volume_mm3(last.to_fill), offered_mm3),
         excess_mm3=volume_mm3(last.too_much),
         excess_before_mm3=volume_mm3(looks[0].plan.too_much),
         options=last.policy,

@@ -29,8 +29,16 @@ from amrepair.template.port import Template
 from gcode.profiles import PrintSetup
 
 
-def plan_is_enough(plan: RepairPlan) -> bool:
-    """Whether the program fills all that is missing, and nothing else is wrong."""
+def plan_is_enough(plan: RepairPlan, late: Afterwards | None = None) -> bool:
+    """Whether the program fills all that is missing, and nothing else is wrong.
+
+    Parameters
+    ----------
+    late
+        What stays open inside, where the part's job is at hand: to be asked about, or not enough.
+    """
+    if late is not None and late.ways:
+        return False
     if plan.within_tolerance:
         return True
     if plan.checked is None or plan.patch is None or plan.too_much:
@@ -59,7 +67,7 @@ def report_of_plan(
         What stays open inside, where the part's job is at hand.
     """
     placed = plan.build_from_template
-    enough = plan_is_enough(plan)
+    enough = plan_is_enough(plan, late)
     return ReportData(
         title=title,
         outcome=outcome_of(result, within_tolerance=enough),

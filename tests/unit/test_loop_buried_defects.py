@@ -116,6 +116,7 @@ def test_nobody_to_ask_the_run_goes_on_and_the_result_has_the_ways(
     assert not report.stopped
     last = report.looks[-1].decision
     assert last.action is Action.OFFER
+    assert not report.within_tolerance
     reprint, leave = last.ways
     assert reprint.layer in (3, 4)  # it begins at 0.8 mm: to a layer, as the scan has it
     assert reprint.filled_mm3 == pytest.approx(leave.left_mm3)
