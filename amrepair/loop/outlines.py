@@ -2,7 +2,8 @@
 
 Slic3r, IceSL and Kiri:Moto write none, and some hosts strip comments. Seen from above, a bead of a
 layer is outermost where nothing is laid beside it: the outside, or a hole. A hole is bounded by
-closed loops alone; a void of sparse infill has a line of it, which is open, at some side.
+closed loops alone, and a bead would fit into it; a void of sparse infill has a line of it, which is
+open, at some side, and where no more loops fit in a slit is left between them.
 """
 
 from __future__ import annotations
@@ -64,10 +65,13 @@ def _at_the_edge(start_mm: PlanePoints, end_mm: PlanePoints, closed: Mask, half_
             low_mm=low, cell_mm=cell, shape=shape,
         )  # fmt: skip
 
-    voids, count = ndimage.label(~covered(np.ones(len(closed), bool)))
+    bare = ~covered(np.ones(len(closed), bool))
+    voids, count = ndimage.label(bare)
     infill = ndimage.binary_dilation(covered(~closed), _BESIDE, iterations=2)
-    of_infill = ndimage.maximum(infill, voids, range(count + 1)) > 0
-    of_infill[[0, voids[0, 0]]] = [True, False]  # the beads themselves; the outside
-    away_mm = cell * ndimage.distance_transform_edt(of_infill[voids])
+    inside = ndimage.maximum(infill, voids, range(count + 1)) > 0
+    free_mm = cell * ndimage.distance_transform_edt(bare)
+    inside |= ndimage.maximum(free_mm, voids, range(count + 1)) < half_mm  # a slit between loops
+    inside[[0, voids[0, 0]]] = [True, False]  # the beads themselves; the outside
+    away_mm = cell * ndimage.distance_transform_edt(inside[voids])
     x, y = np.floor((0.5 * (start_mm + end_mm) - low) / cell).astype(np.int64).T
     return np.asarray(away_mm[y, x] < half_mm + 2 * cell)

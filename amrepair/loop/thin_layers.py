@@ -4,9 +4,10 @@ A bead that gets a share f of its plastic at its layer's height is f of its widt
 such a layer stands in by (1 - f) w / 2 against those of the layers around it, and what the layer
 lacks lies inside, in pores and grooves that later layers have closed over: no look from above sees
 it any more. Each place of the walls is held against the same place in the layers around, so that
-neither a notch nor a scanner's error on one wall counts. Layers of a sound job differ by
-themselves, too: their own scatter is what a run of layers is held against, at a stated rate of
-false alarms.
+neither a notch nor a scanner's error on one wall counts; and against where it is expected, since
+layers that got more plastic than they have room for bulge, and those beside them do not. Layers of
+a sound job differ by themselves, too: their own scatter is what a run of layers is held against, at
+a stated rate of false alarms.
 """
 
 from __future__ import annotations
@@ -263,6 +264,17 @@ class _Walls:
             return float("nan")
         return float(np.median(mine_mm[both] / mine[both] - other_mm[both] / other[both]))
 
+    def in_mm(self, own: tuple[int, int], least: int) -> float:
+        """How far layers [first, end) stand in of where they are expected: the patches' median.
+
+        NaN where fewer than `least` are seen.
+        """
+        total_mm, count = self._sum(*own)
+        seen = count > 0
+        if seen.sum() < least:
+            return float("nan")
+        return float(np.median(total_mm[seen] / count[seen]))
+
     def _sum(self, first: int, end: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         return (
             self.total_mm[:, end] - self.total_mm[:, first],
@@ -296,6 +308,8 @@ def _clearest(
         per_mm = 2.0 / float(width_mm[first:end].mean())
         # against either side: where walls go over from one level to another, they do not
         sides = [walls.over_mm((first, end), [side], options.least_patches) for side in around]
+        # and against where they are to stand: sound layers that bulge make none beside them thin
+        sides.append(walls.in_mm((first, end), options.least_patches))
         lacking = per_mm * min((each for each in sides if np.isfinite(each)), default=0.0)
         if lacking < options.least_lacking:
             continue

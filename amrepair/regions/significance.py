@@ -27,7 +27,7 @@ from scipy.special import comb, log_ndtr, ndtri
 
 from amrepair.arrays import Mask, Numbers, Values
 from amrepair.field import scales_kernels
-from amrepair.field.groups import cell_numbers, connected
+from amrepair.field.groups import cell_numbers, connected, group_points
 from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
 from amrepair.frames import cells_of
 from amrepair.regions.between_views import Said, ViewErrors
@@ -444,13 +444,16 @@ def _level(
     safe = np.clip(z, 0.0, MOST_ERRORS)
     log_p = np.log(n * ways) + together * log_ndtr(-safe)
     far_off_mm = np.zeros(2)
-    low, high = (_peaks(scale, (side > options.tail_from) & ~scale.apart, side) for side in z)
+    over = (z > options.tail_from) & ~scale.apart
+    low, high = (_peaks(scale, *each) for each in zip(over, z, strict=True))
     for side, peaks in enumerate((low, high)):
         if calibration is not None:
             width_mm = scale.width_mm if statistic else None
             far_off = calibration.far_off_in(width_mm, side, len(scale))
             log_p[side] = np.maximum(log_p[side], far_off.log_expected(beyond_mm[side]))
             far_off_mm[side] = far_off.exceeded_by(share)
+        elif _at_one_place(scale, over[side], len((high, low)[side]), options):
+            continue
         elif (tail := _tail(peaks, options)).scale > 0:
             by_tail = np.maximum(log_p[side], tail.log_expected(safe[side]))
             log_p[side] = np.where(scale.apart, log_p[side], by_tail)
@@ -495,6 +498,21 @@ def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
     peak = np.full(len(value), -np.inf)
     np.maximum.at(peak, group[over], value[over])
     return np.sort(peak[np.isfinite(peak)])
+
+
+def _at_one_place(scale: Scale, over: Mask, opposite: int, options: RegionOptions) -> bool:
+    """Whether the peaks of a side are a defect's, by the rules of `_outlying`.
+
+    A break is rough, and its windows are many peaks by themselves. They tell of a scanner's errors
+    only where enough of them lie elsewhere, or enough `opposite` ones on the other side.
+    """
+    if options.one_sided * (opposite + 1) >= LEAST_PEAKS:
+        return False
+    which = np.flatnonzero(over)
+    place = group_points(scale.place_mm[which], reach_mm=scale.width_mm)
+    peaks = np.unique(np.column_stack([place, _groups(scale, over)[which]]), axis=0)
+    largest = int(np.bincount(peaks[:, 0], minlength=1).max())
+    return len(peaks) - largest < LEAST_PEAKS
 
 
 def _tail(peaks: Values, options: RegionOptions) -> Tail:

@@ -26,13 +26,14 @@ from amrepair.loop.locate import (
     walls_moved_mm,
 )
 from amrepair.loop.looks import plan_stops
+from amrepair.loop.outlines import outermost
 from amrepair.loop.sites import sites
 from amrepair.regions import Label, Region, detect
 from amrepair.repair import plan_repair
 from amrepair.scans import Scan
 from amrepair.template import CutTemplate, MeshSdf, StoodTemplate
 from gcode.profiles import load_setup
-from gcode.reader import Job, job_for
+from gcode.reader import Beads, Job, job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 from tests import analytic
@@ -135,6 +136,25 @@ def test_a_job_without_roles_is_placed_by_what_bounds_its_layers() -> None:
         np.abs(placed.matrix[:3] - np.eye(4)[:3] - [[0, 0, 0, 60], [0, 0, 0, 60], [0] * 4]).max()
         < 0.05
     )
+
+
+def test_a_slit_between_loops_is_no_hole_of_the_part() -> None:
+    # regression: of a cone with a bore that Slic3r had cut, loops inside lay at the outside; its
+    # walls were said to lie 0.106 mm off the part's, and the job was refused as another part's
+    half_mm, inner_mm = 0.225, 5.0
+    loops_mm = [8.0, 7.55, 6.9, 6.45, 6.0, 5.55, inner_mm]  # a slit of 0.2 mm after the second
+    corner = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
+    start = np.concatenate([each * corner for each in loops_mm])
+    end = np.concatenate([each * np.roll(corner, -1, axis=0) for each in loops_mm])
+    steps = np.linspace(0.0, 1.0, 9)[:, None, None]  # a side in eight beads
+    way = end - start
+    ends = [np.swapaxes(start + s * way, 0, 1).reshape(-1, 3) for s in (steps[:-1], steps[1:])]
+    count = len(ends[0])
+    size, none = np.full(count, 0.2), np.zeros(count, np.int64)
+    beads = Beads(*ends, 0.09 * size / 0.2, 2.25 * size, size, none, none, none, ("unknown",))
+    found = outermost(beads, np.ones(count, bool), half_mm)
+    of = np.repeat(loops_mm, 32)
+    assert set(of[found]) == {8.0, inner_mm}
 
 
 @pytest.mark.slow
