@@ -27,6 +27,7 @@ from gcode.writer import write
 PLACE_MM = (100.0, 90.0, 0.0)
 SIZE_MM = (16.0, 12.0, 1.6)
 LAYER = 4
+SCANNED = 8_000  # points: a quarter of a millimetre apart, as the simulated scanner's
 
 
 def solid_mesh(solid: m3.Manifold) -> trimesh.Trimesh:
@@ -37,7 +38,7 @@ def solid_mesh(solid: m3.Manifold) -> trimesh.Trimesh:
 def scan_of(solid: m3.Manifold, seed: int = 1, *, sigma_mm: float = 0.02) -> Scan:
     """A cloud of a solid's surface with a little noise, and its normals."""
     mesh = solid_mesh(solid)
-    points, faces = trimesh.sample.sample_surface(mesh, 15_000, seed=seed)
+    points, faces = trimesh.sample.sample_surface(mesh, SCANNED, seed=seed)
     rng = np.random.default_rng(seed)
     noisy = np.asarray(points) + rng.normal(scale=sigma_mm, size=points.shape)
     normals = np.asarray(mesh.face_normals)[faces].astype(np.float32).astype(np.float64)
