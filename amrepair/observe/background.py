@@ -55,14 +55,13 @@ def _of_bed(
     xy_mm = points_mm[near, :2]
     cell = cells_of(xy_mm, xy_mm.min(axis=0), options.bed_cell_mm)
     key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(axis=0) + 1))
-    # sixteen bits are sorted by counting
-    key = key.astype(np.min_scalar_type(int(key.max())))
-    by_cell = near[np.argsort(key, kind="stable")]
+    # by cell, and in each by height: sixteen bits are sorted by counting
+    by_height = np.argsort(height_mm[near])
+    key = key.astype(np.min_scalar_type(int(key.max())))[by_height]
+    by_cell = near[by_height[np.argsort(key, kind="stable")]]
     count = np.bincount(key)
     count = count[count > 0]
-    first = np.cumsum(count) - count
-    heights = np.split(height_mm[by_cell], first[1:])
-    middle_mm = np.array([np.partition(h, len(h) // 2)[len(h) // 2] for h in heights])
+    middle_mm = height_mm[by_cell[np.cumsum(count) - count + count // 2]]
     known = count >= options.bed_points
     lowest_mm = float(middle_mm[known].min(initial=0.0))
     low = known & (middle_mm < max(band_mm, -lowest_mm))

@@ -65,7 +65,7 @@ class Bench:
         (folder / "gcodes" / "small_pla.gcode").write_text(ready.text)
         self.fake = AgentsMoonraker(folder / "gcodes")
         self.klipper = self.fake.klipper
-        self.scans = [scan_of(ready.broken), scan_of(ready.whole)]
+        self.scans = [scan_of(each, spacing_mm=0.18) for each in (ready.broken, ready.whole)]
         monkeypatch.setattr(serving, "LOOK_S", 0.05)
         monkeypatch.setattr(running, "open_scanner", lambda *given: Scripted(self._scan))
         self.starts = True

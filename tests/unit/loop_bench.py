@@ -34,10 +34,12 @@ def solid_mesh(solid: m3.Manifold) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
 
 
-def scan_of(solid: m3.Manifold, seed: int = 1, *, sigma_mm: float = 0.02) -> Scan:
+def scan_of(
+    solid: m3.Manifold, seed: int = 1, *, sigma_mm: float = 0.02, spacing_mm: float = 0.25
+) -> Scan:
     """A cloud of a solid's surface with a little noise, and its normals."""
     mesh = solid_mesh(solid)
-    points, faces = trimesh.sample.sample_surface(mesh, 15_000, seed=seed)
+    points, faces = trimesh.sample.sample_surface(mesh, int(mesh.area / spacing_mm**2), seed=seed)
     rng = np.random.default_rng(seed)
     noisy = np.asarray(points) + rng.normal(scale=sigma_mm, size=points.shape)
     normals = np.asarray(mesh.face_normals)[faces].astype(np.float32).astype(np.float64)

@@ -147,7 +147,7 @@ def test_this_machine() -> None:
 
 def test_without_its_libraries_the_program_still_says_what_is_missing() -> None:
     code = (
-        "import sys; sys.modules['numpy'] = None\n"
+        "import sys; sys.modules.update(numpy=None, open3d=None, torch=None)\n"
         "from amrepair.cli import main; main()"
     )  # fmt: skip
     done = subprocess.run(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,10 +29,12 @@ def modules() -> list[tuple[str, ast.Module]]:
 
 @pytest.fixture(scope="module", autouse=True)
 def _read_no_more() -> Iterator[None]:
-    """A million nodes, which Python's collector of circles would look through ever after."""
+    """A million nodes, which Python's collector of circles would look through time and again."""
+    gc.disable()
     yield
     modules.cache_clear()
     shape.cache_clear()
+    gc.enable()
 
 
 def constants(module: ast.Module) -> Iterator[tuple[str, ast.expr]]:

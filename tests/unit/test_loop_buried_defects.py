@@ -112,7 +112,9 @@ def test_nobody_to_ask_the_run_goes_on_and_the_result_has_the_ways(
     hollowed: tuple[Small, Stop, m3.Manifold], tmp_path: Path
 ) -> None:
     small, stop, stands = hollowed
-    report, _ = small.run(tmp_path / "run", lambda request: scan_of(stands), stops=[stop])
+    report, _ = small.run(
+        tmp_path / "run", lambda request: scan_of(stands, spacing_mm=0.18), stops=[stop]
+    )
     assert not report.stopped
     last = report.looks[-1].decision
     assert last.action is Action.OFFER

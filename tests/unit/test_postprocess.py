@@ -231,7 +231,7 @@ PRUSA_SLICER = shutil.which("prusa-slicer")
 @pytest.mark.skipif(PRUSA_SLICER is None, reason="PrusaSlicer is not installed here")
 def test_prusaslicer_runs_it_and_shows_its_error(tmp_path: Path) -> None:
     part, job, script = tmp_path / "part.stl", tmp_path / "job.gcode", tmp_path / "looks"
-    trimesh.creation.box((18.0, 18.0, 4.0)).export(part)
+    trimesh.creation.box((8.0, 8.0, 4.0)).export(part)
     script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m amrepair postprocess "$@"\n')
     script.chmod(0o755)
     here = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
