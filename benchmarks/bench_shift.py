@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from bench_clean_jobs import NOTHING, judged, mesh_called, scans_of, sliced
+from bench_thin_layers import thin
 
 from amrepair.errors import AlignmentError
 from amrepair.loop import locate_part, plan_stops
@@ -28,12 +29,9 @@ from amrepair.loop.learning import Learning
 from amrepair.loop.sites import sites
 from amrepair.regions import DefectType
 from amrepair.simulate.parameters import DEFAULT_SCANNER, load_world
-from amrepair.simulate.placed import PlacedDefect
 from amrepair.template import MeshSdf
 from gcode.profiles import load_setup
 from gcode.reader import Job
-
-EVERYWHERE_MM = 500.0
 
 
 def moved(job: Job, first: int, by_mm: np.ndarray) -> Job:
@@ -43,16 +41,6 @@ def moved(job: Job, first: int, by_mm: np.ndarray) -> Job:
     return replace(
         job, beads=replace(beads, start_mm=beads.start_mm + aside, end_mm=beads.end_mm + aside)
     )
-
-
-def thin(job: Job, first: int, flow: float) -> PlacedDefect:
-    """Less plastic everywhere from a layer on."""
-    layers = tuple(range(first, len(job.layers)))
-    half_mm = 0.5 * job.layers[first].height_mm
-    low_mm, high_mm = job.layers[first].z_mm - half_mm, job.layers[-1].z_mm + half_mm
-    region = [0.0, 0.0, 1.0, 0.0, EVERYWHERE_MM, EVERYWHERE_MM, low_mm, high_mm, flow]
-    box = np.array([[0.0, 0.0, low_mm - half_mm], [EVERYWHERE_MM, EVERYWHERE_MM, high_mm]])
-    return PlacedDefect("under_extrusion", layers, np.array([region]), None, None, box)
 
 
 def looks(
@@ -71,7 +59,7 @@ def looks(
     angle = 2.0 * np.pi * np.random.default_rng(case).random()
     by = by_mm * np.array([np.cos(angle), np.sin(angle)])
     printed = moved(job, first, by)
-    defects = () if flow >= 1.0 else (thin(job, first, flow),)
+    defects = () if flow >= 1.0 else (thin(job, flow, range(first, len(job.layers))),)
     scans = scans_of(printed, stops, load_world(), args.scanner, args.seed, defects)
     learning = Learning()
     for stop, (seen, pose) in zip(stops, scans, strict=True):

@@ -33,15 +33,14 @@ from gcode.reader import Job
 LAYERS, EVERYWHERE_MM = 3, 500.0
 
 
-def thin(job: Job, flow: float) -> PlacedDefect:
+def thin(job: Job, flow: float, layers: range) -> PlacedDefect:
     """Less plastic everywhere in some layers."""
-    first = len(job.layers) // 3
-    layers = tuple(range(first, first + LAYERS))
-    half_mm = 0.5 * job.layers[first].height_mm
-    low_mm, high_mm = job.layers[first].z_mm - half_mm, job.layers[layers[-1]].z_mm + half_mm
+    low, high = job.layers[layers[0]], job.layers[layers[-1]]
+    half_mm = 0.5 * low.height_mm
+    low_mm, high_mm = low.z_mm - half_mm, high.z_mm + half_mm
     region = [0.0, 0.0, 1.0, 0.0, EVERYWHERE_MM, EVERYWHERE_MM, low_mm, high_mm, flow]
     box = np.array([[0.0, 0.0, low_mm - half_mm], [EVERYWHERE_MM, EVERYWHERE_MM, high_mm]])
-    return PlacedDefect("under_extrusion", layers, np.array([region]), None, None, box)
+    return PlacedDefect("under_extrusion", tuple(layers), np.array([region]), None, None, box)
 
 
 def looks(name: str, flow: float, sound: list[int], seed: int, folder: Path) -> Iterator[Any]:
@@ -50,7 +49,9 @@ def looks(name: str, flow: float, sound: list[int], seed: int, folder: Path) -> 
     setup, job = load_setup(), sliced(part, way, folder)
     template = MeshSdf.from_mesh(mesh_called(part))
     placed = locate_part(job, template, layer_height_mm=setup.process.layer_height_mm)
-    defect, site_at = thin(job, flow), sites(job, template, placed, setup)
+    first = len(job.layers) // 3
+    defect = thin(job, flow, range(first, first + LAYERS))
+    site_at = sites(job, template, placed, setup)
     stops = plan_stops(job, [defect.layers[-1] + more for more in sound], final=False)
     scans = scans_of(job, stops, load_world(), DEFAULT_SCANNER, seed, (defect,))
     mine = (job.beads.layer >= defect.layers[0]) & (job.beads.layer <= defect.layers[-1])
