@@ -73,7 +73,7 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
             console.out.print(line)
         for look in report.looks:
             for way in look.decision.ways:
-                console.out.print(f"{look.stop.label}, found late: {way.told}.")
+                console.out.print(f"{look.stop.label}, what can be done: {way.told}.")
         for felt in begun.felt:
             console.out.print(f"{felt.stop}: {felt.told()}.")
         if report.calibration is not None:

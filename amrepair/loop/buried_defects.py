@@ -6,6 +6,7 @@ Facts for the policy's table: nothing is decided, cut or printed here.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -78,16 +79,25 @@ def ways(
     first = _first_layer(job, stop, min(piece.box_mm[2] for piece in pieces))
     if first is None:
         return (leave,)
-    beads, layer = job.beads, job.layers[first]
+    reprint = printed_again(first, job, stop, setup, command=command)
+    return (replace(reprint, filled_mm3=open_mm3), leave)
+
+
+def printed_again(
+    first: int, job: Job, stop: Stop, setup: PrintSetup, *, command: str = "gcode resume-at JOB"
+) -> Way:
+    """Cut down to below a layer, and print all of what was laid from it on again."""
+    beads = job.beads
     again = (beads.layer >= first) & (beads.line < stop.line)
-    reprint = Way(
-        "reprint", open_mm3, 0.0,
-        print_time_s=_seconds(job, stop.line, setup) - _seconds(job, layer.first_line, setup),
-        filament_mm3=beads.subset(again).volume_mm3,
+    laid_mm3 = beads.subset(again).volume_mm3
+    begun_s = _seconds(job, job.layers[first].first_line, setup)
+    return Way(
+        "reprint", laid_mm3, 0.0,
+        print_time_s=_seconds(job, stop.line, setup) - begun_s,
+        filament_mm3=laid_mm3,
         layer=first, cut_to_mm=job.layers[first - 1].z_mm,
         command=f"{command} --layer {first}",
     )  # fmt: skip
-    return (reprint, leave)
 
 
 def _first_layer(job: Job, stop: Stop, low_mm: float) -> int | None:

@@ -58,11 +58,15 @@ class _Surface:
 
 @dataclass(frozen=True, slots=True)
 class TypeGuess:
-    """A type, how sure it is, and what else is known of it, for people."""
+    """A type, how sure it is, and what else is known of it, for people.
+
+    `layer` is the job's first one that it concerns; None where that is not told.
+    """
 
     type: DefectType
     confidence: float
     told: str = ""
+    layer: int | None = None
 
 
 def typed(
@@ -127,7 +131,11 @@ def typed(
         )  # fmt: skip
     if whole is not None and not any(r.volume_mm3 >= 1.0 for r in regions):
         regions.append(_everywhere(plan, site, whole))
-    return replace(plan, deficit=replace(plan.deficit, regions=tuple(regions)))
+    return replace(
+        plan,
+        deficit=replace(plan.deficit, regions=tuple(regions)),
+        shifted_from=None if whole is None else whole.layer,
+    )
 
 
 def _there(depth_mm: float, tolerance_mm: float) -> float:
@@ -225,7 +233,9 @@ def _aside(
     if found is None:
         return None
     spoils = _sure(found.size_mm, options.shift_layers * plan.layer_height_mm)
-    return TypeGuess(DefectType.LAYER_SHIFT, min(spoils, found.confidence), found.told())
+    return TypeGuess(
+        DefectType.LAYER_SHIFT, min(spoils, found.confidence), found.told(), found.layer
+    )
 
 
 def _between_views_mm(plan: RepairPlan) -> float:

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from amrepair.loop.buried_defects import buried, buried_mm3, covered_at, pieces_of, ways
+from amrepair.loop.buried_defects import (
+    buried,
+    buried_mm3,
+    covered_at,
+    pieces_of,
+    printed_again,
+    ways,
+)
 from amrepair.loop.filaments import other_material
 from amrepair.loop.findings import findings
 from amrepair.loop.looks import Look, Stop
@@ -69,6 +76,11 @@ def decide_look(
         other_material=other_material(plan, job, stop.line),
     )
     decision = decide(verdicts, situation, policy)
+    first = plan.shifted_from
+    if first is not None and decision.action in (Action.STOP, Action.PAUSE):
+        if first > job.turn_at(stop.line).first_layer:
+            decision = replace(decision, ways=(printed_again(first, job, stop, site.setup),))
+        return decision
     if decision.action is not Action.OFFER:
         return decision
     covered = covered_at(plan, here)

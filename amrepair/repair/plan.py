@@ -73,6 +73,8 @@ class RepairPlan:
         looks of the same run.
     covered
         Layers that lack plastic under later ones; None where none are told, or nobody asked.
+    shifted_from
+        The first of the layers that lie aside of those below; None where none are told.
 
     Examples
     --------
@@ -100,6 +102,7 @@ class RepairPlan:
     refused: str = ""
     beds: tuple[Sound, ...] = ()
     covered: CoveredLayers | None = None
+    shifted_from: int | None = None
 
     @property
     def build_from_template(self) -> Transform:

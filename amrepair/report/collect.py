@@ -191,7 +191,16 @@ def loop_result(
                 "ways": [way.to_json() for way in look.decision.ways],
             }
             for look in report.looks
-            if look.decision.ways
+            if look.decision.action is Action.OFFER
+        ],
+        "shifted": [
+            {
+                "stop": look.stop.label,
+                "layer": look.plan.shifted_from,
+                "ways": [way.to_json() for way in look.decision.ways],
+            }
+            for look in report.looks
+            if look.plan.shifted_from is not None
         ],
         "stops": [_stop_row(look) for look in report.looks],
     }

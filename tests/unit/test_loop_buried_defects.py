@@ -142,6 +142,32 @@ def test_a_no_ends_the_run_with_the_command_to_go_on_from(
     assert lines[-1] == "heaters off"
 
 
+def test_layers_that_lie_aside_end_the_run_with_the_layer_to_print_again(
+    hollowed: tuple[Small, Stop, m3.Manifold], tmp_path: Path
+) -> None:
+    small, stop, _ = hollowed
+    first, below_mm = 9, small.job.layers[8].z_mm
+    done = small.part.trim_by_plane((0.0, 0.0, -1.0), -stop.z_mm)
+    low, high = (
+        done.trim_by_plane((0.0, 0.0, sign), sign * below_mm).translate(PLACE_MM)
+        for sign in (-1.0, 1.0)
+    )
+    stands = low + high.translate((0.0, 1.5, 0.0))
+    report, lines = small.run(tmp_path / "run", lambda request: scan_of(stands), stops=[stop])
+    assert f"from layer {first} on it lies aside" in report.stopped
+    assert f"cut the part down to {below_mm:.2f} mm" in report.stopped
+    assert f"gcode resume-at JOB --layer {first}" in report.stopped
+    assert lines[-1] == "heaters off"
+    result = loop_result(
+        report, repaired_ratio=None, gcode=None, seed=0, seconds={}, setup=small.setup
+    )
+    (told,) = result["shifted"]
+    assert (told["stop"], told["layer"]) == ("layer-011", first)
+    (again,) = told["ways"]
+    assert again["filament_mm3"] == pytest.approx(high.volume(), rel=0.06)
+    assert not result["found_late"]
+
+
 @pytest.fixture(scope="module")
 def job_file(
     hollowed: tuple[Small, Stop, m3.Manifold], tmp_path_factory: pytest.TempPathFactory
