@@ -13,9 +13,10 @@ from amrepair.align.bed import bed_prior, level_on_bed
 from amrepair.align.options import DEFAULT_ALIGN, AlignOptions
 from amrepair.align.pam import align_paper
 from amrepair.align.poses import explained
-from amrepair.align.refine import Prior, Refined, refine
+from amrepair.align.refine import Prior, Refined, refine, refine_all
 from amrepair.align.registration import Registration
 from amrepair.align.sizes import other_size, refuse_other_size
+from amrepair.align.standing import stood_up
 from amrepair.align.thinning import in_order, thin_out
 from amrepair.arrays import Mask, Matrix, Points
 from amrepair.errors import AlignmentError, InputError, PartMovedError
@@ -198,6 +199,13 @@ def _from_anywhere(
     _refuse_misfit(scan, found.best, ratio, found.inlier_mm, least, sizes)
     if in_surroundings:
         _refuse_standing_out(scan, found, 1.0 - options.least_of_rest, sizes)
+    if options.stands_upright:  # it is this part, however it stands
+        points = in_order(thin_out(found.part_mm, options.poses.dense_points, rng))
+        best = _as_it_stands(points, template, found.best, found.sigma_mm, options)
+        moved_by = np.linalg.inv(found.best.matrix) @ best.matrix
+        others = tuple(other @ moved_by for other in found.others)
+        ratio = explained(best, found.inlier_mm)
+        found = replace(found, best=best, others=others, explained_ratio=ratio)
     return _registration(scan, found, options)
 
 
@@ -237,6 +245,44 @@ def _as_it_was_seen(
         )
         ratio = explained(best, found.inlier_mm)
     return replace(found, best=best, others=tuple(others), explained_ratio=ratio)
+
+
+def _as_it_stands(
+    points_mm: Points, template: Template, leaning: Refined, sigma_mm: float, options: AlignOptions
+) -> Refined:
+    """Upright, unless a lean explains far more at the scale of the noise.
+
+    Layers that lie aside of those below look like a part that leans, which fits neither of them.
+    """
+    centre = moved(points_mm.mean(axis=0)[None], leaning.matrix)[0]
+    most_rad = np.deg2rad(options.guess.bound_deg)
+    upright = stood_up(template, leaning.matrix, centre, most_rad)
+    turn = upright[:3, :3] @ leaning.matrix[:3, :3].T
+    if turned_rad(turn) < np.deg2rad(options.upright_deg):
+        return leaning
+    scale_mm = options.poses.scale_mm(sigma_mm)
+    # it leans about some place of its own: at first all but the turn is found again
+    as_turned = Prior(np.full(3, options.bed.tilt_sigma_rad), np.full(3, options.guess.bound_mm))
+    stands = refine(
+        points_mm,
+        template,
+        upright,
+        start_scale_mm=options.guess.start_scale_mm,
+        end_scale_mm=scale_mm,
+        sigma_mm=sigma_mm,
+        prior=as_turned,
+    )
+    both = refine_all(
+        points_mm,
+        template,
+        [leaning.matrix, stands.matrix],
+        start_scale_mm=scale_mm,
+        end_scale_mm=scale_mm,
+        sigma_mm=sigma_mm,
+    )
+    leaning_loss, upright_loss = (one.loss(scale_mm) for one in both)
+    is_lean = leaning_loss < options.lean_believed * upright_loss
+    return leaning if is_lean or not both[1].converged else both[1]
 
 
 def _refuse_mirrored(
@@ -345,6 +391,8 @@ def _from_guess(
         prior=prior,
         max_iterations=options.guess.most_steps,
     )
+    if options.stands_upright:
+        found = _as_it_stands(points, expected, found, sigma_mm, options)
     away = found.matrix @ np.linalg.inv(guess.matrix)
     centre = points.mean(axis=0) @ guess.matrix[:3, :3].T + guess.matrix[:3, 3]
     moved_mm = float(np.linalg.norm(away[:3, :3] @ centre + away[:3, 3] - centre))

@@ -531,6 +531,12 @@ class AlignOptions:
     ----------
     least_points
         Of a scan.
+    stands_upright
+        The scan is in the bed's frame, and the part stands on the bed.
+    upright_deg, lean_believed
+        Less is no lean: calibrations are off by as much. Of a part that stands upright a lean is
+        believed that leaves less than this share of the loss that it has upright: one whose layers
+        lie aside has 0.95 and more of it, and one that really leans is found to lean from either.
     least_explained, least_of_known
         Share of the points that the pose must explain: views of other parts lay up to two thirds
         of themselves on one. Where the part is known for certain, nearly every printed defect
@@ -560,6 +566,9 @@ class AlignOptions:
     """
 
     least_points: int = 50
+    stands_upright: bool = False
+    upright_deg: float = 0.3
+    lean_believed: float = 0.5
     least_explained: float = 0.7
     least_of_known: float = 0.35
     much_left_out: float = 0.4

@@ -60,6 +60,11 @@ class Refined:
     converged: bool
     iterations: int
 
+    def loss(self, scale_mm: float) -> float:
+        """Mean Geman–McClure loss of the points at a scale, from 0 to 1."""
+        square = np.square(self.residual_mm)
+        return float((square / (square + scale_mm**2)).mean())
+
 
 def refine(
     points_mm: Points,

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from amrepair.arrays import Box
+from amrepair.arrays import Box, Matrix, Vector
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform, box_of
+from amrepair.frames import Transform, box_of, motion_about, unit_vectors
 from amrepair.template.port import Template
 from gcode.meshes import mesh_of
 from gcode.profiles import PrinterProfile
@@ -26,6 +26,36 @@ def box_on_bed(template: Template, placed: Transform) -> Box:
     """Lowest and highest corner of the part's box, build frame, mm."""
     vertices, _ = mesh_of(template.solid())
     return box_of(placed.apply(np.asarray(vertices, dtype=np.float64)))
+
+
+def stood_up(template: Template, matrix: Matrix, about_mm: Vector, most_rad: float) -> Matrix:
+    """A pose without its lean: the part stands on the face of its hull that is nearly down.
+
+    Parameters
+    ----------
+    matrix
+        Template from build.
+    about_mm
+        (3,) what stays in place, template frame.
+    most_rad
+        What leans by more is another pose, as of a part on a fixture, and stays as it is.
+    """
+    vertices, faces = mesh_of(template.solid().hull())
+    a, b, c = np.asarray(vertices, dtype=np.float64)[np.asarray(faces).T]
+    across = np.cross(b - a, c - a)
+    outward = unit_vectors(across)
+    down = -matrix[:3, 2]
+    near = np.flatnonzero(outward @ down > np.cos(most_rad))
+    if not len(near):
+        return matrix
+    # the triangles of one face have one normal, but for rounding
+    _, face = np.unique(np.round(outward[near], 4), axis=0, return_inverse=True)
+    area = np.bincount(face.ravel(), np.linalg.norm(across[near], axis=1))
+    foot = outward[near[np.argmax(face.ravel() == np.argmax(area))]]
+    axis = np.cross(down, foot)
+    sine = float(np.linalg.norm(axis))
+    turn = axis * (np.arcsin(min(sine, 1.0)) / max(sine, 1e-12))
+    return motion_about(about_mm, turn, np.zeros(3)) @ matrix
 
 
 def refuse_impossible(

@@ -355,7 +355,7 @@ def _say(
             *(f"Left out, {line}." for line in left_out_lines(plan)),
             *_written(plan, output, within=within, older=older),
             *_suggestion(plan, ranked),
-            *(f"Left open inside: {line}." for line in (late.told if late is not None else ())),
+            *(f"By its job: {line}." for line in (late.told if late is not None else ())),
         ):
             console.out.print(line)
     if not within:

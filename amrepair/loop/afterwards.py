@@ -11,7 +11,8 @@ import numpy as np
 
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform
-from amrepair.loop.buried_defects import buried, buried_mm3, pieces_of, ways
+from amrepair.loop.buried_defects import buried, buried_mm3, pieces_of, printed_again, ways
+from amrepair.loop.kinds import shifted
 from amrepair.loop.locate import locate_parts
 from amrepair.loop.looks import plan_stops
 from amrepair.loop.thin_layers import with_covered
@@ -70,16 +71,21 @@ def afterwards(
         That makes the job that is left, without the layer.
     """
     *_, end = plan_stops(job, ())
+    aside = shifted(plan, job, template)
+    # held against the job's beads: only where the part stands at their place
+    stands = aside and not _why_not_again(job, template, plan.build_from_template, setup)
+    if aside is not None and aside.layer is not None and stands:
+        again = printed_again(aside.layer, job, end, setup, command=command)
+        return Afterwards(0.0, (again,), "", f"{aside.told}; no patch mends that")
     plan = with_covered(plan, job, template, end)
     left = buried(pieces_of(plan, ()), end, plan.layer_height_mm, plan.policy)
     open_mm3 = buried_mm3(left)
     if open_mm3 < plan.policy.buried_mm3:
         return Afterwards(open_mm3)
     offered = ways(left, job, end, setup, command=command)
-    placed = plan.build_from_template
     not_again = "it begins in the first layer, and nothing would stand there"
     if len(offered) > 1:
-        not_again = _why_not_again(job, template, placed, setup)
+        not_again = _why_not_again(job, template, plan.build_from_template, setup)
     if not_again:
         offered = tuple(way for way in offered if way.layer is None)
     covered = "" if plan.covered is None else plan.covered.told

@@ -18,16 +18,17 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Box, Mask, PlanePoints, Values
-from amrepair.frames import Transform, turned_rad
+from amrepair.frames import Transform, cells_of, turned_rad
 from amrepair.loop.findings import matching
 from amrepair.loop.kind_options import DEFAULT_KINDS, KindOptions
-from amrepair.loop.layer_shift import Walls, layer_shift
+from amrepair.loop.layer_shift import ShiftOptions, Walls, layer_shift
 from amrepair.loop.shapes import bead_way, last_beads, over_last_beads, spread, tall_mm
 from amrepair.loop.shapes import chain as chain_of
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
 from amrepair.repair import RepairPlan, Site
 from amrepair.scans.facing import facing
+from amrepair.template.port import Template
 from gcode.meshes import box_of_solid
 from gcode.reader import Job
 
@@ -95,7 +96,7 @@ def typed(
         What was missing at the stop before and was filled there, build frame.
     """
     layer_mm = plan.layer_height_mm
-    seen = _surfaces(plan, site, options)
+    seen = _surfaces(plan, site.planned or site.template, options)
     found, flow = [_came_off(plan, build_from_scanner, options)], None
     if seen is not None:
         # a scan that was laid over the upper layers lies aside of its place, as the lower ones do
@@ -138,6 +139,15 @@ def typed(
     )
 
 
+def shifted(
+    plan: RepairPlan, job: Job, template: Template, options: KindOptions = DEFAULT_KINDS
+) -> TypeGuess | None:
+    """Whether layers of a finished part lie aside of those below; None where none are told."""
+    seen = _surfaces(plan, template, options)
+    end = job.layers[-1].end_line
+    return None if seen is None else _aside(plan, job, end, seen, options, from_above=False)
+
+
 def _there(depth_mm: float, tolerance_mm: float) -> float:
     """That a region is there at all: a half at half the tolerance, 15 in 16 at twice."""
     return float(1.0 - 0.25 ** (depth_mm / max(tolerance_mm, 1e-6)))
@@ -149,7 +159,7 @@ def _sure(value: float, limit: float) -> float:
 
 
 def _surfaces(
-    plan: RepairPlan, site: Site, options: KindOptions
+    plan: RepairPlan, expected: Template, options: KindOptions
 ) -> tuple[_Surface, _Surface, float] | None:
     """What was seen of the top, and of the walls, and how high the bed seems to lie.
 
@@ -166,7 +176,6 @@ def _surfaces(
     bed_mm = float(np.median(height[beside])) if len(beside) >= options.least_points else 0.0
     near = np.flatnonzero((np.abs(deviation) < 3.0) & (height > options.low_wall_mm))
     near = near[:: max(1, -(-len(near) // (4 * options.most_points)))]
-    expected = site.planned or site.template
     gradient = expected.distance_and_gradient(points[near])[1]
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     outward = placed.rotate(gradient / np.maximum(length, 1e-9))
@@ -209,8 +218,12 @@ def _aside(
     line: int,
     seen: tuple[_Surface, _Surface, float],
     options: KindOptions,
+    *,
+    from_above: bool = True,
 ) -> TypeGuess | None:
     """Whether layers lie aside of those below.
+
+    What is not seen `from_above` has floors of hollows, too, which are no tops of beads.
 
     It is no surer than the shift is large: what it does to the print is a matter of its size.
     """
@@ -220,6 +233,9 @@ def _aside(
     normals = plan.build_from_template.rotate(facing(scan, some, neighbours=options.faced_by))
     upward = normals[:, 2] if scan.normals is not None else np.abs(normals[:, 2])
     place_mm = plan.build_from_template.apply(scan.points_mm[some[upward > options.top_cosine]])
+    if not from_above:
+        every_mm = plan.build_from_template.apply(scan.points_mm)
+        place_mm = place_mm[~_under_roof(place_mm, every_mm, options.shift)]
     beads_mm = options.short_layers * plan.layer_height_mm
     found = layer_shift(
         place_mm - np.array([0.0, 0.0, bed_mm]),
@@ -236,6 +252,17 @@ def _aside(
     return TypeGuess(
         DefectType.LAYER_SHIFT, min(spoils, found.confidence), found.told(), found.layer
     )
+
+
+def _under_roof(
+    place_mm: Float[np.ndarray, "p 3"], scan_mm: Float[np.ndarray, "s 3"], options: ShiftOptions
+) -> Bool[np.ndarray, " p"]:
+    """Which points lie under a point of the scan that is higher by more than a roof is thick."""
+    cell = cells_of(scan_mm[:, :2], scan_mm[:, :2].min(axis=0), options.column_mm)
+    top_mm = np.full(tuple(cell.max(axis=0) + 1), -np.inf)
+    np.maximum.at(top_mm, tuple(cell.T), scan_mm[:, 2])
+    own = cells_of(place_mm[:, :2], scan_mm[:, :2].min(axis=0), options.column_mm)
+    return np.asarray(top_mm[tuple(own.T)] > place_mm[:, 2] + options.roof_mm)
 
 
 def _between_views_mm(plan: RepairPlan) -> float:

@@ -75,6 +75,9 @@ class ShiftOptions:
     first_layers, refined
         At first one in so many layers is tried as the first that lies aside; and so many of the
         best first moves are refined.
+    column_mm, roof_mm
+        Edge of a column, a bead and a half, in which what lies so far below the highest point is
+        under a roof.
     cell_mm, most_cells
         Edge of a column; it grows where a plate would have more of them.
     layers_back, growth
@@ -102,6 +105,8 @@ class ShiftOptions:
     second_points: int = 1_500
     first_layers: int = 3
     refined: int = 2
+    column_mm: float = 0.7
+    roof_mm: float = 0.6
     cell_mm: float = 0.1
     most_cells: int = 1_500_000
     layers_back: int = 8
@@ -496,6 +501,8 @@ def _climbed(
     step_mm, total = 0.5 * seen.options.step_mm, -np.inf
     while step_mm > 0.99 * seen.options.finest_mm:
         around = fit.move + step_mm * np.vstack([np.zeros(4), ways])
+        # beyond it the rasters end
+        around = around[(np.abs(around) <= seen.options.reach_mm).all(axis=1)]
         told = seen.evidence(layer, around, weights)
         if told.argmax() and told.max() > total:
             total = float(told.max())

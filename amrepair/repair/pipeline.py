@@ -216,7 +216,7 @@ def _align(
                 part_is_known=site.part_is_known,
                 so_far=scan_scope.planned_so_far(site),
                 aside=scan_scope.beside_part(site),
-                options=scan_scope.align_options(site),
+                options=scan_scope.align_options(site, scan),
                 rng=rng,
                 progress=progress,
             )

@@ -101,14 +101,17 @@ def within_planned(scan: Scan, site: Site) -> Scan:
     return scan.subset(scan.points_mm[:, 2] > _trusted_from_mm(site.planned, site))
 
 
-def align_options(site: Site) -> AlignOptions:
+def align_options(site: Site, scan: Scan) -> AlignOptions:
     """The site's alignment options, adapted to a raft and to a print that is still low.
 
     By default a point must be some way above the bed to count as the part's. After a first layer of
     0.2 mm no point is, so for a low print half the printed height is enough. On a raft the bed lies
-    deeper below the part's foot, and what is not the part reaches farther out.
+    deeper below the part's foot, and what is not the part reaches farther out. A finished part that
+    is scanned in the bed's frame stands upright there, unless it lies on a fixture.
     """
     top_mm, options = layer_top_mm(site), site.options.align
+    if scan.frame == "build" and site.printed_z_mm is None and not site.on_fixture:
+        options = replace(options, stands_upright=True)
     if site.raft is not None:
         bed, raft = options.bed, site.raft
         bed = replace(bed, under_foot_mm=raft.height_mm, skirt_mm=max(bed.skirt_mm, raft.reach_mm))

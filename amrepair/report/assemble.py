@@ -37,7 +37,7 @@ def plan_is_enough(plan: RepairPlan, late: Afterwards | None = None) -> bool:
     late
         What stays open inside, where the part's job is at hand: to be asked about, or not enough.
     """
-    if late is not None and late.ways:
+    if late is not None and late.told:
         return False
     if plan.within_tolerance:
         return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from dataclasses import replace
 from functools import cache
@@ -224,6 +225,24 @@ def test_a_finished_part_is_offered_the_ways_and_the_command_makes_the_program(
     assert job_file.with_name("rest.gcode").stat().st_size > 1000
 
 
+def test_of_a_finished_part_whose_layers_lie_aside_the_first_is_told(
+    hollowed: tuple[Small, Stop, m3.Manifold], job_file: Path
+) -> None:
+    # regression: its edges were chips and blobs, and the program for them was all that was told
+    small, *_ = hollowed
+    low, high = (small.part.trim_by_plane((0.0, 0.0, s), s * 1.8) for s in (-1.0, 1.0))
+    scan = scan_of((low + high.translate((0.0, 1.2, 0.0))).translate(PLACE_MM))
+    path = job_file.with_name("aside.xyz")
+    np.savetxt(path, np.hstack([scan.points_mm, scan.normals]), fmt="%.4f")
+    done = CliRunner().invoke(repair_app, [*words_for(path, job_file), "--part-pose", "job"])
+    assert done.exit_code == 3, done.output
+    told = " ".join(done.output.split())
+    assert re.search(
+        r"job: from layer 9 on it lies aside of what is below, \+1\.[123] mm in Y", told
+    )
+    assert "--layer 9" in told
+
+
 def test_a_part_that_was_moved_cannot_be_printed_again_from_a_layer_on(
     hollowed: tuple[Small, Stop, m3.Manifold], job_file: Path
 ) -> None:
@@ -232,7 +251,7 @@ def test_a_part_that_was_moved_cannot_be_printed_again_from_a_layer_on(
     words = words_for(hollow_at(small, moved, job_file.with_name("moved.xyz")), job_file)
     done = CliRunner().invoke(repair_app, words)
     told = " ".join(done.output.split())
-    assert "Left open inside: let it be" in told
+    assert "By its job: let it be" in told
     assert "resume-at" not in told
     assert "the part stands up to 3.0" in told
     assert "put it back there" in told

@@ -64,7 +64,7 @@ def test_walls_that_are_gone_on_one_side_leave_the_pose_alone(small: Small) -> N
     gone = (there[:, 1] < 0.5 * (low[1] + high[1])) & (there[:, 2] > top_mm - 0.7 * layer_mm)
     lower = replace(scan, points_mm=scan.points_mm - gone[:, None] * [0.0, 0.0, layer_mm])
     guess = Transform("template", "scanner", small.placed.inverse().matrix)
-    options = align_options(site)
+    options = align_options(site, lower)
     found = align(lower, site.template, guess=guess, so_far=planned_so_far(site), options=options)
     aside_mm = found.template_from_scan.apply(scan.points_mm) - there
     assert np.abs(aside_mm).max() < 0.05
