@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from amrepair.arrays import Mask, Points, VoxelMask
 from amrepair.field.groups import area_per_point
@@ -78,7 +78,7 @@ def find_occupancy(
     sought = Labelling(scan, grid, facets, watched, unexplained(scan, facets, grid.voxel_mm))
     solid = grid.labelled(sought.empty()).solid
     found = _as_seen(solid, scan, grid)
-    found |= _guessed(found, (*surface, seen), scan, grid)
+    found |= _guessed(found, (*surface, seen), replace(scan, on_mm=on_mm), grid)
     return Occupancy(grid.low_mm, grid.voxel_mm, found, grid.f_mm < 0)
 
 
@@ -157,17 +157,22 @@ def _guessed(
     if not ends.any():
         return np.zeros_like(void)
     (box,) = ndimage.find_objects(void.astype(np.int8))
-    nearest = ndimage.distance_transform_edt(
-        ~ends[box], return_distances=False, return_indices=True
-    )
     # a gap in what was scanned of an end, no wider than points are asked for, is chance
     across = 2 * math.ceil(width_mm / grid.voxel_mm) + 1
     known, every = (
         ndimage.uniform_filter(one[box].astype(np.float32), across, mode="constant")
         for one in (np.logical_or.reduce([*scanned.values()]), ends)
     )
+    guess = ends[box] & (known < 0.5 * every)
+    if not guess.any():
+        return np.zeros_like(void)
+    to_known, to_guess = (
+        ndimage.distance_transform_edt(~one) if one.any() else np.full(one.shape, np.inf)
+        for one in (ends[box] & ~guess, guess)
+    )
     guessed = void.copy()
-    guessed[box] &= (known < 0.5 * every)[tuple(nearest)]
+    # past the border of what was scanned of an end both are as near, as far as its points tell it
+    guessed[box] &= to_guess < to_known + width_mm / grid.voxel_mm
     if guessed.any():
         guessed &= ~_looked_into(void, scanned, surface, scan, grid)
     return guessed
@@ -184,22 +189,44 @@ def _looked_into(
     far as to an end that was scanned (by axis and way), or right through.
 
     What hides a part of the surface ends not just where its faces meet: what lies beside hidden
-    surface, and does not face away from it, may be hidden, too.
+    surface, and does not face away from it, may be hidden, too. Nor would surface have been seen
+    beyond all that was: there the scanner's view may have ended.
     """
     places_mm, normals, seen = surface
     hidden = _hidden(normals, seen, scan.options)
     within_mm = scan.options.seen_spacings * scan.spacing_mm + grid.voxel_mm
+    hull = _hull_of(np.concatenate([scan.on_mm, scan.broken.place_mm]))
     mouths, looked = {}, np.zeros_like(void)
     for (axis, way), index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
         toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
         known = way * feet_on(scan.template, middle_mm)[1][:, axis] > LEAST_FACING
         known &= ~has_near(middle_mm, places_mm[toward], within_mm)
+        known[known] = _amid(middle_mm[known], hull, scan.options.hole_mm)
         mouths[axis, way] = _marked(void, index), _marked(void, index[known])
     for (axis, way), (_, known) in mouths.items():
         through, _ = mouths[axis, -way]
         found = through | scanned[axis, -way]
         looked |= _along(void, known, axis, -way) & _along(void, found, axis, way)
     return looked
+
+
+def _amid(points_mm: Points, hull: Float[np.ndarray, "h 4"], beyond_mm: float) -> Mask:
+    """Which points lie in a convex hull, by the planes of its faces, or hardly beyond it."""
+    amid = np.ones(len(points_mm), bool)
+    for face in hull:
+        amid[amid] = points_mm[amid] @ face[:3] + face[3] < beyond_mm
+    return amid
+
+
+def _hull_of(points_mm: Points) -> Float[np.ndarray, "h 4"]:
+    """Planes of the faces of what holds all points: outward unit normals, and offsets.
+
+    A hull of none, if they lie in a plane.
+    """
+    try:
+        return np.asarray(ConvexHull(points_mm).equations)
+    except QhullError:
+        return np.array([[0.0, 0.0, 0.0, np.inf]])
 
 
 def _facets_toward(

@@ -212,7 +212,7 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
             options=OccupancyOptions(least_seen=least_seen),
         )
         emptied_mm3.append(float((found.designed & ~found.solid).sum()) * found.voxel_mm**3)
-    assert emptied_mm3[0] > 5_000.0  # what the labels alone would say
+    assert emptied_mm3[0] > 4_000.0  # what the labels alone would say
     assert emptied_mm3[1] == 0.0
 
 
@@ -253,6 +253,21 @@ def test_a_dent_beside_a_bump_that_nobody_saw_does_not_take_it_along() -> None:
     template = MeshSdf.from_mesh(solid_mesh(part))
     deficit = compute_deficit(scan, template, build_from_template=PLACED)
     assert deficit.missing_mm3 == pytest.approx((part ^ cut).volume(), rel=0.1)
+
+
+@pytest.mark.parametrize("seen_mm", [20.0, 26.0])
+def test_a_notch_at_the_end_of_the_view_does_not_take_the_rest_along(seen_mm: float) -> None:
+    # regression: where the view ended within a notch, all that it had not seen was told missing,
+    # 27 times what was; of the head's way past it, too, nothing stood there
+    block = analytic.box((0, 0, 0), (40, 12, 10))
+    cut = m3.Manifold.cube((12, 14, 10)).translate((16, -1, 6))
+    points, _ = analytic.noisy_scan_points(block.body - cut, spacing_mm=0.3, sigma_mm=0.05, seed=3)
+    seen = points[(points[:, 0] < seen_mm) & (points[:, 2] > 0.4)]
+    deficit = compute_deficit(Scan(seen, 0.05, "template"), block, build_from_template=PLACED)
+    unseen_mm3 = (deficit.missing - m3.Manifold.cube((seen_mm, 12, 10))).volume()
+    gone_mm3 = 12.0 * 4.0 * (seen_mm - 16.0)
+    assert deficit.missing_mm3 - unseen_mm3 == pytest.approx(gone_mm3, rel=0.15)
+    assert unseen_mm3 < 0.6 * gone_mm3  # it was 7.3 and 3.0 of it
 
 
 @pytest.mark.parametrize(
