@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -96,7 +97,12 @@ def call(
 def here(*words: str | Path, program: str = "amrepair") -> subprocess.CompletedProcess[str]:
     """Run `amrepair` or `gcode` in this process: where what is loaded, and how, does not matter."""
     main = importlib.import_module(f"{program}.cli").main
-    out, err, argv = io.StringIO(), io.StringIO(), [program, *map(str, words)]
+    return ended([program, *map(str, words)], main)
+
+
+def ended(argv: list[str], main: Callable[[], object]) -> subprocess.CompletedProcess[str]:
+    """How `main` ends in this process, called by a command line with the program's name first."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
     with (
         pytest.MonkeyPatch.context() as patch,
         warnings.catch_warnings(action="ignore"),
@@ -107,7 +113,5 @@ def here(*words: str | Path, program: str = "amrepair") -> subprocess.CompletedP
         try:
             main()
         except SystemExit as end:
-            return subprocess.CompletedProcess(
-                argv, int(end.code or 0), out.getvalue(), err.getvalue()
-            )
-    raise AssertionError("a command ends by itself")
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(argv, code, out.getvalue(), err.getvalue())

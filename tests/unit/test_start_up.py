@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from gcode.firmware import EmulatedPrinterProcess
+from gcode.profiles import load_printer
+
 ROOT = Path(__file__).parents[2]
 # Not pydantic, which typer itself loads where it is installed.
 HEAVY = frozenset(
@@ -75,6 +78,16 @@ def test_an_emulated_printer_loads_no_kernels() -> None:
     # regression: of 0.6 s that each one took to start, 0.3 s loaded heights that few printers feel
     code = "import sys, gcode.firmware.child; assert not {'numba', 'scipy'} & sys.modules.keys()"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_an_emulated_printer_is_started_as_it_is_outside_the_tests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where they are forked from a warm process (tests/emulators.py), this one is not."""
+    monkeypatch.setattr("gcode.firmware.process.subprocess", subprocess)
+    with EmulatedPrinterProcess(printer=load_printer("generic_marlin")) as machine:
+        assert machine.state()["hotend_target_c"] == 0
+        assert "gcode.firmware.child" in Path(f"/proc/{machine.pid}/cmdline").read_text()
 
 
 def test_compiled_kernels_do_not_load_what_multiplies_matrices() -> None:
