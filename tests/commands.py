@@ -1,18 +1,25 @@
-"""Commands as people and scripts call them, each in a process of its own.
+"""Commands as people and scripts call them: in this process, or each in one of its own.
 
-That process is forked from one where the libraries are loaded already: loading them anew takes
+Such a process is forked from one where the libraries are loaded already: loading them anew takes
 three seconds of processor time a call, which is longer than what most calls do.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import importlib
+import io
 import json
 import os
 import subprocess
 import sys
 import tempfile
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 # Reads a call a line, and answers with how its process ended; loads first what argv[1] says.
@@ -85,3 +92,26 @@ def call(
         server.stdin.flush()
         code = int(server.stdout.readline())
         return subprocess.CompletedProcess(argv, code, out.read(), err.read())
+
+
+def here(*words: str | Path, program: str = "amrepair") -> subprocess.CompletedProcess[str]:
+    """Run `amrepair` or `gcode` in this process: where what is loaded, and how, does not matter."""
+    main = importlib.import_module(f"{program}.cli").main
+    return ended([program, *map(str, words)], main)
+
+
+def ended(argv: list[str], main: Callable[[], object]) -> subprocess.CompletedProcess[str]:
+    """How `main` ends in this process, called by a command line with the program's name first."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        warnings.catch_warnings(action="ignore"),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        patch.setattr(sys, "argv", argv)
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(argv, code, out.getvalue(), err.getvalue())

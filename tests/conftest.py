@@ -8,12 +8,16 @@ import importlib
 import os
 import shutil
 import signal
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import hypothesis
 import pytest
+
+from tests.emulators import Forked
 
 # Workers share the cores: threads of one that spin for their turn take the other's time.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
@@ -83,6 +87,16 @@ def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     tempfile.tempdir = None
     del os.environ["TMPDIR"]
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _printers_are_forked() -> Iterator[None]:
+    """Emulated printers start at once, but where a test has them started as anywhere else."""
+    with pytest.MonkeyPatch.context() as patch:
+        if hasattr(os, "pidfd_open"):
+            forked = SimpleNamespace(**{**vars(subprocess), "Popen": Forked})
+            patch.setattr("gcode.firmware.process.subprocess", forked)
+        yield
 
 
 @pytest.fixture(scope="session")

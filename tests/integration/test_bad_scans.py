@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ from amrepair.errors import InputError
 from amrepair.scans import Scan, write_ply
 from amrepair.template import MeshSdf, fit_template
 from amrepair.template.options import FitOptions
+from tests.commands import here
 
 PART = Path(__file__).parents[2] / "examples" / "parts" / "bracket.stl"
 
@@ -66,30 +65,11 @@ def make(folder: Path, kind: str) -> Path:
     elif kind == "micrometres":
         text(path, surface(1e3))
     elif kind == "another":
-        ball = trimesh.creation.icosphere(subdivisions=4, radius=33.0)
+        ball = trimesh.creation.icosphere(subdivisions=3, radius=33.0)
         text(path, np.asarray(ball.vertices))
     else:
         pcd(path, points, cut=100)
     return path
-
-
-# Run-time checks of the test suite do not know typer's annotations: another process, for all calls.
-CALLS = """
-import contextlib, io, json, sys, warnings
-warnings.simplefilter("ignore")
-from amrepair.cli import main
-answers = []
-for words in json.load(sys.stdin):
-    out, err, code = io.StringIO(), io.StringIO(), None
-    sys.argv = ["amrepair", *words]
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            main()
-        except SystemExit as left:
-            code = left.code
-    answers.append([code, out.getvalue(), err.getvalue()])
-json.dump(answers, sys.stdout)
-"""
 
 
 SAID = {
@@ -130,18 +110,12 @@ def answers(
             words = ["template", "fit", folder / "a.ply", path, "-o", out]
         calls.append([str(word) for word in words])
         files.append((path, out))
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", CALLS],
-        input=json.dumps(calls),
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=True,
-        cwd=PART.parents[2],
-    )
-    said = json.loads(done.stdout)
+    said = [here(*words) for words in calls]
     keys = [*CASES, ("fit", "metres")]
-    return {key: (*pair, answer) for key, pair, answer in zip(keys, files, said, strict=True)}
+    return {
+        key: (*pair, [done.returncode, done.stdout, done.stderr])
+        for key, pair, done in zip(keys, files, said, strict=True)
+    }
 
 
 @pytest.mark.parametrize(("command", "kind"), CASES)

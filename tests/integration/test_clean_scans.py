@@ -21,7 +21,7 @@ OURS = Path(__file__).parents[2] / "examples" / "parts"
 DATA = os.environ.get("AMREPAIR_DATA")
 PARTS = [pytest.param(OURS / "knob.stl", marks=pytest.mark.slow), OURS / "pebble.stl"]
 REAL = sorted((Path(DATA) / "parts").glob("prusa-[a-z]*.stl"))[:10] if DATA else []
-NOISE_MM, SPACING_MM, POSE_MM, LAYER_MM = 0.04, 0.2, 0.05, 0.2
+NOISE_MM, SPACING_MM, POSE_MM, LAYER_MM = 0.04, 0.25, 0.05, 0.2
 IN_PLACE = Transform.identity("build", "template")
 
 

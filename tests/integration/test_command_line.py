@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from tests.commands import ROOT, call
+from tests.commands import ROOT, here
 
 KNOB = ROOT / "examples" / "parts" / "knob.stl"
 DATA = os.environ.get("AMREPAIR_DATA")
@@ -62,7 +62,7 @@ def test_a_bad_part_is_refused_in_one_sentence(
     bad: dict[str, Path], kind: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    refused(call("simulate", bad[kind], "--out", out), "larger" if kind == "large" else "mesh")
+    refused(here("simulate", bad[kind], "--out", out), "larger" if kind == "large" else "mesh")
     assert not out.exists()
 
 
@@ -78,7 +78,7 @@ def test_a_bad_part_is_refused_in_one_sentence(
 )
 def test_broken_meshes_from_the_wild_end_in_words(name: str, tmp_path: Path) -> None:
     out = tmp_path / "out.safetensors"
-    done = call("template", "fit", Path(str(DATA)) / "bad" / name, "-o", out)
+    done = here("template", "fit", Path(str(DATA)) / "bad" / name, "-o", out)
     if done.returncode != 0:
         refused(done, "mesh")
         assert not out.exists()
@@ -101,23 +101,23 @@ def test_broken_meshes_from_the_wild_end_in_words(name: str, tmp_path: Path) -> 
     ],
 )  # fmt: skip
 def test_bad_usage_is_refused(words: list[str], said: str) -> None:
-    refused(call(*words), said)
+    refused(here(*words), said)
 
 
 def test_an_output_that_cannot_be_written_is_refused_before_work_begins() -> None:
-    refused(call("simulate", KNOB, "--out", "/proc/nowhere/out"), "cannot be written")
+    refused(here("simulate", KNOB, "--out", "/proc/nowhere/out"), "cannot be written")
 
 
 def test_an_unknown_option_is_a_usage_error() -> None:
-    done = call("simulate", "--nonsense")
+    done = here("simulate", "--nonsense")
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("program", ["amrepair", "gcode"])
 def test_help_and_version(program: str) -> None:
-    assert call("--help", program=program).returncode == 0
-    assert "0.1.0" in call("--version", program=program).stdout
+    assert here("--help", program=program).returncode == 0
+    assert "0.1.0" in here("--version", program=program).stdout
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     words = ["repair", chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", out]
     standing = tmp_path / "standing.npz"
     words += ["--part-pose", "100,80,0,0", "--report", report, "--standing", standing, "--json"]
-    done = call(*words)
+    done = here(*words)
     # 3: a strip beside the chip's cliff stays out of the nozzle's reach
     assert done.returncode in (0, 3), done.stderr
     # neither warnings of libraries nor what they think is leaked at the end; only progress
@@ -167,15 +167,15 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     assert homing == ["G28 X Y"]
     assert report.stat().st_size > 10_000
     # regression: nothing wrote what --as-built needs, so nobody could check or send a repair
-    assert call("check", out, program="gcode").returncode == 2  # Z is not homed
-    checked = call("check", out, "--as-built", standing, program="gcode")
+    assert here("check", out, program="gcode").returncode == 2  # Z is not homed
+    checked = here("check", out, "--as-built", standing, program="gcode")
     assert checked.returncode == 0, checked.stderr
     assert "prusa_mk3s is taken, for which it was sliced" in checked.stderr
     copy = f"file:{tmp_path / 'sent.gcode'}"
-    sent = call("send", out, "--as-built", standing, "--port", copy, program="gcode")
+    sent = here("send", out, "--as-built", standing, "--port", copy, program="gcode")
     assert sent.returncode == 0, sent.stderr
     assert (tmp_path / "sent.gcode").read_text().rstrip() == text.rstrip()
-    estimate = json.loads(call("estimate", out, "--json", program="gcode").stdout)
+    estimate = json.loads(here("estimate", out, "--json", program="gcode").stdout)
     assert estimate["filament_mm"] == pytest.approx(result["filament_mm"], rel=0.01)
     (x0, y0, _), (x1, y1, z1) = result["regions"][0]["box_mm"]
     assert 131 < x0 < 133.5
@@ -193,7 +193,7 @@ def test_a_repair_that_is_not_needed_leaves_no_older_program(
     # and 0.4 mm in the air: no raft is so thin that nobody needs to know
     np.savetxt(whole, np.asarray(points)[seen] + (100.0, 80.0, 0.4), fmt="%.4f")
     out.write_text("G28\n")
-    done = call("repair", whole, "--template", chipped["part.stl"], "-o", out)
+    done = here("repair", whole, "--template", chipped["part.stl"], "-o", out)
     said = " ".join(done.stdout.split())
     assert "(prusa_mk3s): the default, since no --printer is given." in said
     assert done.returncode == 0, done.stderr
@@ -205,7 +205,7 @@ def test_a_repair_that_is_not_needed_leaves_no_older_program(
 
 def test_an_aligned_scan_is_a_ply(chipped: dict[str, Path], tmp_path: Path) -> None:
     words = [chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", tmp_path / "a.foo"]
-    refused = call("align", *words)
+    refused = here("align", *words)
     assert refused.returncode == 2
     assert ".ply" in refused.stderr
     assert not (tmp_path / "a.foo").exists()
@@ -215,7 +215,7 @@ def test_align_and_detect_write_what_the_contract_says(
     chipped: dict[str, Path], tmp_path: Path
 ) -> None:
     words = [chipped["scan.xyz"], "--template", chipped["part.stl"], "--json"]
-    aligned = call("align", *words, "-o", tmp_path / "aligned.ply")
+    aligned = here("align", *words, "-o", tmp_path / "aligned.ply")
     assert aligned.returncode == 0, aligned.stderr
     result = json.loads(aligned.stdout)
     assert {"template_from_scan", "rmse_mm", "inlier_ratio", "symmetric_alternatives",
@@ -226,7 +226,7 @@ def test_align_and_detect_write_what_the_contract_says(
     assert (spread > 1e-7).all()
     assert (spread[:3] < 1e-3).all()
     assert (spread[3:] < 0.02).all()
-    detected = call("detect", *words, "--out", tmp_path / "d")
+    detected = here("detect", *words, "--out", tmp_path / "d")
     assert detected.returncode == 0, detected.stderr
     archive = np.load(tmp_path / "d" / "anomaly.npz")
     count = len(np.loadtxt(chipped["scan.xyz"]))
@@ -248,20 +248,20 @@ def test_a_bent_part_is_taken_when_it_is_known(chipped: dict[str, Path], tmp_pat
     np.savetxt(tmp_path / "bent.xyz", points, fmt="%.4f")
     words = ["detect", tmp_path / "bent.xyz", "--template", chipped["part.stl"]]
     words += ["--out", tmp_path / "d", "--json"]
-    refused = call(*words)
+    refused = here(*words)
     assert refused.returncode == 2
     assert "--part-is-known" in refused.stderr
-    taken = call(*words, "--part-is-known")
+    taken = here(*words, "--part-is-known")
     assert taken.returncode == 0, taken.stderr
     assert len(json.loads(taken.stdout)["regions"]) > 2
     # regression: `repair` named the option and did not have it
     words = ["repair", *words[1:4], "-o", tmp_path / "repair.gcode"]
-    refused = call(*words)
+    refused = here(*words)
     assert refused.returncode == 2
     assert "--part-is-known" in refused.stderr
-    taken = call(*words, "--part-is-known")
+    taken = here(*words, "--part-is-known")
     assert taken.returncode in (0, 3), taken.stderr
-    many = call("align", tmp_path / "bent.xyz", "--template", tmp_path, "--part-is-known")
+    many = here("align", tmp_path / "bent.xyz", "--template", tmp_path, "--part-is-known")
     assert many.returncode == 2
     assert "needs one template" in many.stderr
 
@@ -271,18 +271,18 @@ def test_slice_check_and_estimate_work_together(chipped: dict[str, Path], tmp_pa
     placed.apply_translation((100, 80, 0))
     placed.export(tmp_path / "placed.stl")
     job = tmp_path / "job.gcode"
-    sliced = call("slice", tmp_path / "placed.stl", "-o", job, "--json", program="gcode")
+    sliced = here("slice", tmp_path / "placed.stl", "-o", job, "--json", program="gcode")
     assert sliced.returncode == 0, sliced.stderr
     result = json.loads(sliced.stdout)
     assert result["beads_mm3"] == pytest.approx(40 * 30 * 12, rel=0.02)
     assert 1.24e-3 < result["filament_g"] / result["beads_mm3"] < 1.3e-3  # PLA, and the skirt
-    assert call("check", job, program="gcode").returncode == 0
+    assert here("check", job, program="gcode").returncode == 0
     broken = tmp_path / "broken.gcode"
     broken.write_text(job.read_text().replace("M109 S215", "M109 S415", 1))
-    done = call("check", broken, "--json", program="gcode")
+    done = here("check", broken, "--json", program="gcode")
     assert done.returncode == 2
     assert json.loads(done.stdout)["refusals"][0]["limit"] == "300 °C"
-    done = call("slice", chipped["broken.stl"], "-o", "/proc/x.gcode", program="gcode")
+    done = here("slice", chipped["broken.stl"], "-o", "/proc/x.gcode", program="gcode")
     assert done.returncode == 2
 
 
@@ -298,22 +298,22 @@ def test_a_patch_on_what_stands_there(chipped: dict[str, Path], tmp_path: Path) 
     solid.export(tmp_path / "piece.stl")
     out = tmp_path / "patch.gcode"
     words = ["slice", tmp_path / "piece.stl", "-o", out, "--as-built", names["broken"], "--json"]
-    done = call(*words, program="gcode")
+    done = here(*words, program="gcode")
     assert done.returncode == 0, done.stderr
     # less a strip along two walls, where the nozzle's cone does not get down
     assert 0.88 * 76.8 <= json.loads(done.stdout)["beads_mm3"] <= 76.8
-    done = call("check", out, "--as-built", names["broken"], program="gcode")
+    done = here("check", out, "--as-built", names["broken"], program="gcode")
     assert done.returncode == 0, done.stderr
     # the same program on the part as it should be would plough through it
-    assert call("check", out, "--as-built", names["part"], program="gcode").returncode == 2
+    assert here("check", out, "--as-built", names["part"], program="gcode").returncode == 2
 
 
 def test_profiles_are_listed_and_shown() -> None:
-    listed = json.loads(call("profiles", "list", "--json", program="gcode").stdout)
+    listed = json.loads(here("profiles", "list", "--json", program="gcode").stdout)
     assert "prusa_mk3s" in listed["printers"]
-    shown = json.loads(call("profiles", "show", "standard_0.20", program="gcode").stdout)
+    shown = json.loads(here("profiles", "show", "standard_0.20", program="gcode").stdout)
     assert shown["infill_ratio"] == 0.15
-    refused(call("profiles", "show", "nothing", program="gcode"), "is no profile")
+    refused(here("profiles", "show", "nothing", program="gcode"), "is no profile")
 
 
 def test_send_prints_on_an_emulated_printer(tmp_path: Path) -> None:
@@ -325,12 +325,12 @@ def test_send_prints_on_an_emulated_printer(tmp_path: Path) -> None:
     lines += ["G1 Z0.3 F720", "G1 X50 Y50 F6000", "G1 X90 E3 F1000", "M104 S0", "M140 S0"]
     job.write_text("\n".join(lines) + "\n")
     with EmulatedPrinterProcess("prusa", printer=load_printer("prusa_mk3s")) as machine:
-        done = call("send", job, "--port", machine.port, "--json", program="gcode")
+        done = here("send", job, "--port", machine.port, "--json", program="gcode")
         assert done.returncode == 0, done.stderr
         assert json.loads(done.stdout)["lines_acked"] == len(lines)
         motion = machine.take_motion()
     assert motion.filament_mm.sum() == pytest.approx(3.0)
-    assert call("send", job, "--port", "/dev/nothing", program="gcode").returncode == 4
+    assert here("send", job, "--port", "/dev/nothing", program="gcode").returncode == 4
 
 
 def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
@@ -347,7 +347,7 @@ def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
     job, drop, out = tmp_path / "job.gcode", tmp_path / "scans", tmp_path / "run"
     drop.mkdir()
     words = ["slice", tmp_path / "placed.stl", "--place", "keep", "-o", job]
-    assert call(*words, program="gcode").returncode == 0
+    assert here(*words, program="gcode").returncode == 0
     stop = threading.Event()
 
     def scan() -> None:
@@ -368,7 +368,7 @@ def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
         with EmulatedPrinterProcess("prusa", printer=load_printer("prusa_mk3s")) as machine:
             words = ["loop", job, "--template", tmp_path / "part.stl", "--port", machine.port]
             words += ["--scanner", f"watch:{drop}", "--approve", "auto", "--out", out, "--json"]
-            done = call(*words)
+            done = here(*words)
     finally:
         stop.set()
         eye.join()
@@ -378,13 +378,13 @@ def test_the_loop_prints_a_job_and_takes_scans_from_a_folder(
     assert result["missing_mm3_after"] is not None
     assert (out / "report.html").is_file()
     assert (out / "scan-1.ply").is_file()
-    again = call("replay", out, "--json")
+    again = here("replay", out, "--json")
     assert (again.returncode, json.loads(again.stdout)["same"]) == (0, True), again.stderr
-    refused(call("loop", "--resume", out), "was printed to its end")
+    refused(here("loop", "--resume", out), "was printed to its end")
     record = out / "run.jsonl"
     record.write_text(
         record.read_text().replace(
             '"decision": {"action": "go on"', '"decision": {"action": "stop"'
         )
     )
-    assert call("replay", out).returncode == 1
+    assert here("replay", out).returncode == 1

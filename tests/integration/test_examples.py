@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
+import functools
 import re
-import subprocess
+import runpy
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +17,7 @@ import pytest
 from gcode.check import find_refusals
 from gcode.moves import Program
 from gcode.profiles import load_setup
+from tests.commands import ended
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -128,14 +129,15 @@ def test_no_example_goes_untested() -> None:
     "name",
     [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES],
 )
-def test_example(name: str, tmp_path: Path) -> None:
+def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if name in NEEDS and find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not there yet")
-    words = [sys.executable, "-W", "ignore", str(EXAMPLES / f"{name}.py"), "--out", str(tmp_path)]
+    script = str(EXAMPLES / f"{name}.py")
+    monkeypatch.syspath_prepend(EXAMPLES)  # as where it is run by itself
     with serving(name) as (more, environment):
-        done = subprocess.run(
-            [*words, *more], capture_output=True, text=True, timeout=280, check=False,
-            env={**os.environ, **environment},
-        )  # fmt: skip
+        for key, value in environment.items():
+            monkeypatch.setenv(key, value)
+        run = functools.partial(runpy.run_path, script, run_name="__main__")
+        done = ended([script, "--out", str(tmp_path), *more], run)
     assert done.returncode == 0, done.stderr
     CASES[name](done.stdout, tmp_path)

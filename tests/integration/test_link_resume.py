@@ -20,7 +20,7 @@ from link_forks import Forks, until
 
 from gcode.cli import main
 from gcode.hosts.journal import Journal
-from tests.commands import call
+from tests.commands import here
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_the_command_line_goes_on_after_a_kill(
     first.communicate()
     assert first.returncode == -signal.SIGKILL
     until(lambda: b"targets of 0" in notes(bench.journal))
-    done = call(*words, "--resume", program="gcode", quiet=True)
+    done = here(*words, "--resume", program="gcode")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["ok"]

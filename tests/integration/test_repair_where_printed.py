@@ -16,7 +16,7 @@ from gcode.reader import job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 from tests import analytic
-from tests.commands import call
+from tests.commands import here
 
 SETUP = load_setup("prusa_mk3s", "pla", "repair_0.20")
 BLOCK = m3.Manifold.cube((20.0, 14.0, 5.0)).translate((90.0, 90.0, 0.0))
@@ -55,10 +55,10 @@ def test_what_the_job_laid_beside_is_none_of_the_part(broken: Path, tmp_path: Pa
     # part "did not fit its template", whatever was said
     words = ["repair", broken / "scan.xyz", "--template", broken / "part.stl"]
     words += ["-o", tmp_path / "repair.gcode", "--job", broken / "job.gcode", "--json"]
-    refused = call(*words)
+    refused = here(*words)
     assert refused.returncode == 2
     assert "say --part-pose job" in refused.stderr
-    done = call(*words, "--part-pose", "job")
+    done = here(*words, "--part-pose", "job")
     result = json.loads(done.stdout)
     assert result["missing_mm3_before"] == pytest.approx((BLOCK ^ CORNER).volume(), rel=0.1)
     assert result["excess_mm3_before"] < 0.5

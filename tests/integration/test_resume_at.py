@@ -22,7 +22,7 @@ from gcode.firmware import EmulatedPrinterProcess, FirmwareCore
 from gcode.moves import Program
 from gcode.profiles import EnvelopeSlice, PrinterProfile, PrintSetup, load_setup
 from gcode.resumption import Resumption, resume_at
-from tests.commands import call
+from tests.commands import here
 
 DATA = os.environ.get("AMREPAIR_DATA")
 
@@ -258,7 +258,7 @@ def test_the_command_line_makes_it_and_prints_it(tmp_path: Path) -> None:
     job.write_text(tower(4.0).text)
     words = ["--printer", "generic_marlin"]
     where = ["-o", out, "--standing", field, "--json"]
-    made = call("resume-at", job, "--z-mm", "2.0", *words, *where, program="gcode")
+    made = here("resume-at", job, "--z-mm", "2.0", *words, *where, program="gcode")
     assert made.returncode == 0, made.stderr
     told = json.loads(made.stdout)
     assert (told["layer"], told["standing_mm"], told["primed"]) == (10, 2.0, "on the bed")
@@ -271,9 +271,9 @@ def test_the_command_line_makes_it_and_prints_it(tmp_path: Path) -> None:
         emulator.take_motion()
         journal = tmp_path / "journal.sqlite"
         send = ("send", out, "--port", emulator.port, *words, "--journal", journal, "--json")
-        refused = call(*send, program="gcode")  # nobody said that something stands there
+        refused = here(*send, program="gcode")  # nobody said that something stands there
         assert refused.returncode == 2
-        done = call(*send, "--as-built", field, program="gcode")
+        done = here(*send, "--as-built", field, program="gcode")
         assert done.returncode == 0, done.stderr
         motion = emulator.take_motion()
         state = emulator.state()

@@ -16,7 +16,7 @@ from amrepair.frames import moved, rotation_from_vector
 from amrepair.scans import Scan, write_ply
 from amrepair.template import load_template
 from tests.analytic import AnalyticTemplate, box, cylinder, difference, sample_surface, union
-from tests.commands import call
+from tests.commands import here
 
 pytestmark = pytest.mark.slow  # half a minute each: whole fits
 
@@ -58,7 +58,7 @@ def written(path: Path, points: np.ndarray, seed: int) -> Path:
 
 
 def fitted(scans: list[Path], out: Path) -> subprocess.CompletedProcess[str]:
-    return call("template", "fit", *scans, "-o", out, "--json", quiet=True)
+    return here("template", "fit", *scans, "-o", out, "--json")
 
 
 def test_views_of_two_parts_are_refused_with_the_groups_by_name(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import trimesh
 from amrepair.frames import rotation_from_vector
 from amrepair.scans import Scan, write_ply
 from amrepair.template import LearnedSdf, MeshSdf, load_mesh, load_template
-from tests.commands import ROOT, call
+from tests.commands import ROOT, here
 
-pytestmark = pytest.mark.slow  # a minute of work, all of it in other processes
+pytestmark = pytest.mark.slow  # a minute of work
 
 PARTS = ROOT / "examples" / "parts"
 
@@ -33,12 +33,12 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One part learned from scans, one from its mesh."""
     folder = tmp_path_factory.mktemp("library")
     scans = [write_scan(folder / f"{k}.ply", "bracket", k, 2.0 * k) for k in range(3)]
-    done = call("template", "fit", *scans, "-o", folder / "bracket.safetensors")
+    done = here("template", "fit", *scans, "-o", folder / "bracket.safetensors")
     assert done.returncode == 0, done.stderr
     assert "3 of 3 scans merged" in done.stderr
     for scan in scans:
         scan.unlink()
-    done = call("template", "fit", PARTS / "pebble.stl", "-o", folder / "pebble.safetensors")
+    done = here("template", "fit", PARTS / "pebble.stl", "-o", folder / "pebble.safetensors")
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -54,7 +54,7 @@ def test_a_template_from_scan_files_is_the_part(library: Path) -> None:
 
 def test_the_right_template_of_a_folder_is_taken(library: Path, tmp_path: Path) -> None:
     scan = write_scan(tmp_path / "scan.ply", "bracket", 7, 1.0)
-    done = call("align", scan, "--template", library, "--json")
+    done = here("align", scan, "--template", library, "--json")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert said["template"] == "bracket"
@@ -67,19 +67,19 @@ def test_the_published_alignment_on_the_command_line(library: Path, tmp_path: Pa
     scan = write_scan(tmp_path / "scan.ply", "bracket", 8, 0.0)
     template = library / "bracket.safetensors"
     words = ["align", scan, "--template", template, "--json", "--method", "paper"]
-    done = call(*words, "--pam", "ransac=off", "--pam", "variant=code")
+    done = here(*words, "--pam", "ransac=off", "--pam", "variant=code")
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert said["method"] == "paper"
     assert np.abs(np.array(said["template_from_scan"]) - np.eye(4)).max() < 0.5
-    done = call("align", scan, "--template", template, "--pam", "icp=off")
+    done = here("align", scan, "--template", template, "--pam", "icp=off")
     assert done.returncode == 2
     assert "--pam belongs to --method paper" in done.stderr
 
 
 def test_the_mesh_of_a_template_is_written_and_told(library: Path, tmp_path: Path) -> None:
     output = tmp_path / "pebble.stl"
-    done = call("template", "mesh", library / "pebble.safetensors", "-o", output)
+    done = here("template", "mesh", library / "pebble.safetensors", "-o", output)
     assert done.returncode == 0, done.stderr
     made, part = trimesh.load(output), trimesh.load(PARTS / "pebble.stl")
     assert made.is_watertight

@@ -65,26 +65,27 @@ def grown(tops_mm: np.ndarray, cell_mm: float, part: HeadSlice) -> np.ndarray:
         return np.asarray(ndimage.shift(wide, (-middle[0], -middle[1]), order=0, cval=0.0))
     radius_mm = max(part.radius_mm, part.radius_to_mm)
     n = int(np.ceil(radius_mm / cell_mm))
-    i, j = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
-    apart = np.hypot(i, j) * cell_mm
-    keep, less = apart < radius_mm, np.zeros(len(apart))
+    apart = np.hypot(*np.mgrid[-n : n + 1, -n : n + 1]) * cell_mm
+    half, less = ((apart < radius_mm).sum(axis=1) - 1) // 2, np.zeros(apart.shape)
     if part.radius_to_mm > 0:
         rise = (part.to_mm - part.above_mm) / (part.radius_to_mm - part.radius_mm)
         less = rise * np.maximum(apart - part.radius_mm, 0.0)
     # what no neighbour is lower than lies behind one of them, seen from anywhere
     edges = np.argwhere(tops_mm > ndimage.minimum_filter(tops_mm, 3, mode="nearest"))
-    return _spread(tops_mm, edges, np.stack([i[keep], j[keep]], axis=1), less[keep])
+    return _spread(tops_mm, edges, half, less)
 
 
 @njit(cache=True)
-def _spread(tops, edges, under, less):  # type: ignore[no-untyped-def]
-    out = tops.copy()
+def _spread(tops, edges, half, less):  # type: ignore[no-untyped-def]
+    """Row by row of the disc, which is `half` cells to either side there: no branch within."""
+    out, n = tops.copy(), len(half) // 2
     for e in range(len(edges)):
         i, j = edges[e]
-        for u in range(len(under)):
-            a, b = i + under[u, 0], j + under[u, 1]
-            if 0 <= a < out.shape[0] and 0 <= b < out.shape[1]:
-                out[a, b] = max(out[a, b], tops[i, j] - less[u])
+        for row in range(max(n - i, 0), min(n - i + out.shape[0], len(half))):
+            a, shift = i - n + row, n - j
+            for b in range(max(j - half[row], 0), min(j + half[row] + 1, out.shape[1])):
+                here, over = tops[i, j] - less[row, b + shift], out[a, b]
+                out[a, b] = here if here > over else over
     return out
 
 

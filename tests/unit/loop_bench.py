@@ -35,11 +35,20 @@ def solid_mesh(solid: m3.Manifold) -> trimesh.Trimesh:
 
 
 def scan_of(
-    solid: m3.Manifold, seed: int = 1, *, sigma_mm: float = 0.02, spacing_mm: float = 0.25
+    solid: m3.Manifold,
+    seed: int = 1,
+    *,
+    sigma_mm: float = 0.02,
+    spacing_mm: float = 0.25,
+    count: int | None = None,
 ) -> Scan:
-    """A cloud of a solid's surface with a little noise, and its normals."""
+    """A cloud of a solid's surface with a little noise, and its normals.
+
+    Of so many points, or as many as lie `spacing_mm` apart.
+    """
     mesh = solid_mesh(solid)
-    points, faces = trimesh.sample.sample_surface(mesh, int(mesh.area / spacing_mm**2), seed=seed)
+    count = count or int(mesh.area / spacing_mm**2)
+    points, faces = trimesh.sample.sample_surface(mesh, count, seed=seed)
     rng = np.random.default_rng(seed)
     noisy = np.asarray(points) + rng.normal(scale=sigma_mm, size=points.shape)
     normals = np.asarray(mesh.face_normals)[faces].astype(np.float32).astype(np.float64)

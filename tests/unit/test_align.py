@@ -184,7 +184,7 @@ def test_layers_that_lack_half_of_their_plastic_are_no_other_part() -> None:
 
 
 def test_another_part_is_refused(template: MeshSdf) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
     with pytest.raises(AlignmentError, match="does not fit"):
         align(Scan(np.asarray(ball.vertices), 0.03, "scanner"), template)
 

@@ -45,7 +45,7 @@ def field_of(
     `beside`: (n, 3) points that the scan has besides.
     """
     standing = mesh_of(part - gone)
-    points, faces = trimesh.sample.sample_surface(standing, int(standing.area / 0.04), seed=1)
+    points, faces = trimesh.sample.sample_surface(standing, int(standing.area / 0.0625), seed=1)
     noise = np.random.default_rng(0).normal(scale=0.03, size=points.shape)
     seen = np.asarray(standing.face_normals)[faces][:, 2] > least_up
     own = (np.asarray(points) + noise)[seen]

@@ -18,6 +18,7 @@ from amrepair.doctor.options import tunables
 from amrepair.errors import MissingDependencyError
 from amrepair.policy import PolicyOptions
 from gcode.profiles import profile_dir
+from tests.commands import here
 
 ROOT = Path(__file__).parents[2]
 
@@ -131,11 +132,7 @@ def test_the_command(monkeypatch: pytest.MonkeyPatch, healthy: bool) -> None:
 
 
 def test_this_machine() -> None:
-    code = "from amrepair.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, "doctor", "--json"],
-        capture_output=True, text=True, timeout=120, check=False, cwd=ROOT,
-    )  # fmt: skip
+    done = here("doctor", "--json")
     result = json.loads(done.stdout)
     assert done.returncode == (0 if result["ok"] else 2), done.stderr
     states = {check["name"]: check["state"] for check in result["checks"]}

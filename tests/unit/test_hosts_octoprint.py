@@ -23,7 +23,7 @@ from gcode.hosts import LinkLostError, PrintReport, connect
 from gcode.hosts.octoprint import OctoPrintPrinter
 from gcode.hosts.secret import ApiKey, find_key
 from gcode.hosts.web import Address, WebTiming
-from tests.commands import call
+from tests.commands import here
 
 KEY = "SECRET0123456789"
 QUICK = WebTiming(request_s=5.0, upload_s=5.0, answer_s=5.0, lost_s=0.3, poll_s=0.02)
@@ -444,7 +444,7 @@ def test_gcode_send_prints_through_it(
 
     def send(key: str) -> subprocess.CompletedProcess[str]:
         monkeypatch.setenv("OCTOPRINT_API_KEY", key)
-        return call("send", job, "--port", port, "--json", program="gcode")
+        return here("send", job, "--port", port, "--json", program="gcode")
 
     done = send(KEY)
     assert done.returncode == 0, done.stderr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from link_forks import ROOT
 
 from gcode.hosts.telemetry import RoundTrips
 from gcode.hosts.wirelog import FLUSH_ENTRIES, WireLog
+from tests.commands import here
 
 
 def test_the_log_turns_over_and_keeps_the_latest(tmp_path: Path) -> None:
@@ -77,7 +77,10 @@ def test_no_trips_no_percentiles() -> None:
     assert RoundTrips().summary_s() == (0.0, 0.0, 0.0)
 
 
-def test_the_command_line_tells_counters_and_times(tmp_path: Path) -> None:
+def test_the_command_line_tells_counters_and_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     job, wire = tmp_path / "job.gcode", tmp_path / "wire.log"
     lines = ["M190 S60", "M109 S205", "G28", "G90", "M83", "G1 Z5 F600"]
     lines += [f"G1 X{50 + i % 90} Y{60 + i % 7} F6000" for i in range(300)]
@@ -97,15 +100,7 @@ def test_the_command_line_tells_counters_and_times(tmp_path: Path) -> None:
         port = emulator.stdout.readline().strip()
         words = ["send", str(job), "--port", port, *printer, "--window", "1"]
         words += ["--wire-log", str(wire), "--json"]
-        done = subprocess.run(
-            [*program, *words],
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-            cwd=ROOT,
-            env={**os.environ, "XDG_STATE_HOME": str(tmp_path)},
-        )
+        done = here(*words, program="gcode")
         emulator.send_signal(signal.SIGINT)
     assert emulator.returncode == 0
     assert not Path(port).exists()

@@ -20,7 +20,7 @@ from amrepair.loop.kinds import typed
 from amrepair.loop.shapes import last_beads
 from amrepair.regions import Label, Region
 from amrepair.regions.anomaly import DefectType
-from amrepair.repair import plan_repair
+from amrepair.repair import RepairPlan, plan_repair
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from gcode.meshes import box_of_solid, mesh_of
@@ -49,21 +49,28 @@ def scene(bench: ModuleType):  # type: ignore[no-untyped-def]
     return bench.scene(bench.part_called("block"), load_setup())
 
 
-def types_of(  # type: ignore[no-untyped-def]
-    bench: ModuleType, scene, kind: str, seed: int, *, repaired: bool = False
-) -> dict[str, float]:
-    """Volume found by type; at least a crumb for each region."""
+POSE = Transform.identity("build", "scanner")
+
+
+def planned(bench: ModuleType, scene, kind: str, seed: int) -> RepairPlan:  # type: ignore[no-untyped-def]
+    """What is found of a kind of defect, before it is typed."""
     job, stop, placed, site = scene
-    pose = Transform.identity("build", "scanner")
     rng, part = np.random.default_rng([seed, bench.KINDS.index(kind)]), bench.part_called("block")
     built = bench.made(kind, job, stop.line, rng)
     scan = bench.scan_of(built, min(0.5 * built.signal_mm, 0.2), rng, part)
-    plan = plan_repair(
-        scan, site, title="", guess=placed.inverse() @ pose, strict=False,
+    return plan_repair(
+        scan, site, title="", guess=placed.inverse() @ POSE, strict=False,
         wanted=lambda region: False, rng=np.random.default_rng(seed),
     )  # fmt: skip
+
+
+def types_in(  # type: ignore[no-untyped-def]
+    plan: RepairPlan, scene, *, repaired: bool = False
+) -> dict[str, float]:
+    """Volume found by type; at least a crumb for each region."""
+    job, stop, _, site = scene
     found: dict[str, float] = {}
-    for region in typed(plan, job, site, stop.line, pose, repaired=repaired).deficit.regions:
+    for region in typed(plan, job, site, stop.line, POSE, repaired=repaired).deficit.regions:
         assert 0.0 <= region.confidence <= 1.0
         found[str(region.type)] = found.get(str(region.type), 0.0) + region.volume_mm3 + 1e-3
     return found
@@ -71,15 +78,16 @@ def types_of(  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("kind", ["void", "missing_beads", "layer_shift", "string"])
 def test_a_defect_is_told_by_its_surface(bench: ModuleType, scene, kind: str) -> None:  # type: ignore[no-untyped-def]
-    found = types_of(bench, scene, kind, 0)
+    found = types_in(planned(bench, scene, kind, 0), scene)
     assert max(found, key=found.__getitem__) == kind
 
 
 def test_what_a_patch_left_is_no_clog(bench: ModuleType, scene) -> None:  # type: ignore[no-untyped-def]
     # regression: a third of a mm³ that a patch had left ended the run, the nozzle that had laid
     # the patch being said to be clogged
-    assert "clog" in types_of(bench, scene, "clog", 0)
-    assert "clog" not in types_of(bench, scene, "clog", 0, repaired=True)
+    plan = planned(bench, scene, "clog", 0)
+    assert "clog" in types_in(plan, scene)
+    assert "clog" not in types_in(plan, scene, repaired=True)
 
 
 @pytest.mark.slow
@@ -87,7 +95,7 @@ def test_what_a_patch_left_is_no_clog(bench: ModuleType, scene) -> None:  # type
 def test_nine_of_ten_are_told(bench: ModuleType, scene, seed: int) -> None:  # type: ignore[no-untyped-def]
     right = 0
     for kind in bench.KINDS:
-        found = types_of(bench, scene, kind, 100 + seed)
+        found = types_in(planned(bench, scene, kind, 100 + seed), scene)
         right += bool(found) and max(found, key=found.__getitem__) == kind
     assert right >= 0.9 * len(bench.KINDS)
 

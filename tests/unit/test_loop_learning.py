@@ -24,7 +24,7 @@ from amrepair.repair import Site
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan, ScanRequest
 
-LAYERS = (2, 3, 4, 5)
+LAYERS = (2, 3, 4)
 WAVE_MM, HIGH_MM = 8.0, 0.05  # less than is a defect anywhere, more than this process leaves
 PROCESS_MM = 0.01
 

@@ -142,10 +142,10 @@ def seen_from(solid: m3.Manifold, way: tuple[float, float, float], seed: int) ->
     """(n, 3) points of one bare view of a solid from far away, with a silhouette and shadows."""
     mesh = solid.to_mesh64()
     shape = trimesh.Trimesh(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts))
-    points, faces = trimesh.sample.sample_surface(shape, int(shape.area / 0.3**2), seed=seed)
+    points, faces = trimesh.sample.sample_surface(shape, int(shape.area / 0.4**2), seed=seed)
     toward = np.array(way) / np.linalg.norm(way)
     across = np.linalg.svd(toward[None])[2][1:]
-    pixel = np.floor(points @ across.T / 0.6).astype(np.int64)
+    pixel = np.floor(points @ across.T / 0.8).astype(np.int64)
     _, pixel = np.unique(pixel, axis=0, return_inverse=True)
     height = points @ toward
     topmost = np.full(pixel.max() + 1, -np.inf)

@@ -29,7 +29,7 @@ from gcode.profiles import load_setup
 from gcode.protocol import command_in
 from gcode.slicing.job import slice_part
 from gcode.writer import write
-from tests.commands import call
+from tests.commands import here
 
 SIDE_MM, HIGH_MM, LAYER_MM = 24.0, 4.0, 0.2
 SETUP = load_setup("ender_3", "pla", "standard_0.20")  # sparse infill under five solid layers
@@ -211,7 +211,7 @@ def test_a_failure_leaves_the_job_and_ends_with_one_line(tmp_path: Path) -> None
     """The slicer shows what stands on standard error, and fails where the exit code is not 0."""
     file = tmp_path / "job.gcode"
     file.write_text("G28\nG1 X5\n")
-    done = call("postprocess", "--for", "marlin", file)
+    done = here("postprocess", "--for", "marlin", file)
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert "extrudes nothing" in done.stderr

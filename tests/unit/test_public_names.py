@@ -15,6 +15,7 @@ import pytest
 
 import amrepair
 import gcode
+from amrepair.device import _WhenUsed
 
 # A name that goes, goes with a new major version; one that comes, comes with a new minor one.
 NAMES = {
@@ -70,10 +71,20 @@ def test_from_scan_to_program_neither_torch_nor_open3d_is_loaded() -> None:
         "import sys, amrepair, gcode\n"
         "for package in (amrepair, gcode):\n"
         "    for name in package.__all__: getattr(package, name)\n"
-        "assert not {'torch', 'open3d'} & set(sys.modules), 'loaded too early'"
+        "assert not {'torch', 'open3d'} & set(sys.modules), 'loaded too early'\n"
+        # regression: the web server that open3d loads with itself took longer than all else of it
+        "from amrepair.device import open3d\n"
+        "assert open3d().geometry.PointCloud\n"
+        "assert 'dash' not in sys.modules, 'a web server'"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_what_is_loaded_when_used_is_what_is_meant() -> None:
+    text, at = _WhenUsed("json", "dumps"), _WhenUsed("json", "decoder")
+    assert text([1]) == "[1]"
+    assert at.JSONDecoder is json.JSONDecoder
 
 
 def examples() -> list[str]:
