@@ -22,6 +22,8 @@ PRESS_MM = 0.06
 # depth and no wall: there it only keeps a rim that just touches a cell from being taken to miss it.
 SIDE_MM = 0.03
 CONE_SIDE_MM = 0.01
+# In cells of this size; in wider ones a cone, which rises by one in one, reads as much deeper.
+PRESS_CELL_MM = 0.1
 LEAST_TOLD_MM = 0.1
 
 
@@ -50,7 +52,8 @@ def least_tip(
             widening_mm=part.widening_mm,
             height_mm=part.height_mm,
         )
-        return under_mm - part.z_from_mm - PRESS_MM
+        deeper_mm = max(field.cell_mm - PRESS_CELL_MM, 0.0)
+        return under_mm - part.z_from_mm - max(PRESS_MM - deeper_mm, 0.0)
     rows, columns = (finer * (w.stop - w.start) for w in window)
     least = np.empty((rows, columns))
     cell_mm = field.cell_mm / finer

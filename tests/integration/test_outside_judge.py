@@ -210,3 +210,20 @@ def test_contact_of_the_cone_is_told_however_walls_lie_to_columns(aside_mm: floa
     text = f"G1 Z2.2\nG1 X{68.0 + aside_mm - 1.1 + 0.083:.3f} Y55\nG1 Y57\n"
     told = cone_contact_mm(text, _mesh(stands), box, HEADS["prusa_mk3s"])
     assert told == pytest.approx(0.083, abs=0.011)
+
+
+@pytest.mark.parametrize("cell_mm", [0.13, pytest.param(0.2, marks=pytest.mark.slow)])
+def test_what_stands_of_a_large_part_is_known_in_wider_cells_and_cleared(cell_mm: float) -> None:
+    # regression: a cone reads deeper in wider cells, and the checker refused such repairs, as of a
+    # spool holder of 168 mm: "0.11 mm deep, limit 0.1 mm"
+    block = _box((24.0, 24.0, 10.0), (100.0, 100.0, 0.0))
+    crater = Solid.cylinder(6.0, 3.0, 7.0, 64).translate((112.0, 112.0, 5.03))
+    piece, rest = block ^ crater, block - crater
+    setup = load_setup()
+    as_built = HeightField.from_manifold(rest, cell_mm, margin_mm=8.0)
+    plan = slice_patch(
+        piece, setup, as_built=as_built, grid=LayerGrid.from_setup(setup), standalone=True
+    )
+    program = write(plan.toolpath, setup, title="crater", resume=None, restore=False)
+    assert not find_refusals(program, setup, as_built=as_built)
+    assert sum(r.volume_mm3 * r.reachable_ratio for r in plan.regions) > 0.5 * piece.volume()

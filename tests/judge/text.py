@@ -40,8 +40,9 @@ def read_steps(text: str) -> Steps:
         elif command == "G92":
             e = values.get("E", e)
         elif command == "G28":
+            named = set(raw.split(";")[0].upper()[3:]) & set("XYZ") or set("XYZ")
             for k, letter in enumerate("XYZ"):
-                if letter in raw.split(";")[0][3:] or len(words) == 1:
+                if letter in named:
                     at[k] = 0.0
         elif command in ("G0", "G1"):
             to = at.copy()
