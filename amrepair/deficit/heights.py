@@ -177,9 +177,11 @@ def _sharpened(
     # what is much lower was seen on another side: of this one no point fell into the cell
     beneath = seen.z_mm[at] < z_mm - options.trust_mm
     known = seen.seen[at]
-    # where something is missing it was seen to be; below it there is what was expected, and at
-    # its rim, where columns and cells do not end alike
+    # where something is missing it was seen to be, near a point of the scan, or nothing is left to
+    # be seen; below it there is what was expected, and at its rim, where columns and cells do not
+    # end alike
     rim = ndimage.maximum_filter(gone, around)
+    rim &= ndimage.maximum_filter(known, around) | (z_mm <= 0.0)
     sharp = np.where(known, by_wall | agrees | beneath, rim)
     return HeightField(
         fine.origin_mm, fine.cell_mm, np.where(sharp, z_mm, seen.z_mm[at]), known | rim

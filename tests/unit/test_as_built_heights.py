@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from amrepair.deficit import compute_deficit
-from amrepair.deficit.heights import _without_fins, standing_heights
+from amrepair.deficit.heights import _without_fins, as_built_heights, standing_heights
 from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -98,6 +98,21 @@ def test_the_rim_of_a_lost_bridge_is_no_wall() -> None:
     part = box(0, 0, 0, 40, 10, 6) - box(10, -1, -1, 30, 11, 4)
     field = field_of(part, box(18, -1, 3, 35, 11, 7))
     assert heights(field, (18.5, 34.5), (-0.5, 10.5)).max() < 3.25
+
+
+def test_where_the_view_ended_what_is_told_missing_still_stands_for_the_head() -> None:
+    # regression: of a break of which half was seen all was filled, and the head went 4 mm deep into
+    # what stood in the half that was not
+    part, told = box(0, 0, 0, 40, 30, 12), box(10, 10, 6, 30, 20, 13)
+    x, y = np.meshgrid(np.arange(0.1, 20.0, 0.25), np.arange(0.1, 30.0, 0.25))
+    inside = (x > 10.0) & (y > 10.0) & (y < 20.0)
+    seen = np.column_stack([x.ravel(), y.ravel(), np.where(inside, 6.0, 12.0).ravel()])
+    cloud = Scan(seen, 0.03, "template")
+    template = MeshSdf.from_mesh(mesh_of(part))
+    coarse = as_built_heights(cloud, template, 0.25, build_from_template=HERE, printed_z_mm=None)
+    field, *_ = standing_heights(coarse, part, told ^ part, m3.Manifold())
+    assert heights(field, (11.0, 19.0), (11.0, 19.0)).max() < 6.2
+    assert heights(field, (22.0, 29.0), (11.0, 19.0)).min() > 11.9
 
 
 def test_a_thin_roof_that_is_left_is_a_floor() -> None:
