@@ -206,6 +206,13 @@ def rotation_from_vector(vector_rad: Vector) -> Float[np.ndarray, "3 3"]:
     return np.asarray(np.eye(3) + first * skew + second * (skew @ skew))
 
 
+def turn_between(one: Vector, other: Vector) -> Vector:
+    """The axis-angle vector that turns a unit vector to another, no more than 90° from it."""
+    axis = np.cross(one, other)
+    sine = float(np.linalg.norm(axis))
+    return np.asarray(axis * (np.arcsin(min(1.0, sine)) / max(sine, 1e-12)))
+
+
 def turned_rad(rotation: Float[np.ndarray, "3 3"]) -> float:
     """By how much a rotation turns, about whatever axis; 0 to π."""
     cosine = (np.trace(rotation) - 1.0) / 2.0

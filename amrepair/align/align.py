@@ -202,10 +202,11 @@ def _from_anywhere(
     if options.stands_upright:  # it is this part, however it stands
         points = in_order(thin_out(found.part_mm, options.poses.dense_points, rng))
         best = _as_it_stands(points, template, found.best, found.sigma_mm, options)
-        moved_by = np.linalg.inv(found.best.matrix) @ best.matrix
-        others = tuple(other @ moved_by for other in found.others)
-        ratio = explained(best, found.inlier_mm)
-        found = replace(found, best=best, others=others, explained_ratio=ratio)
+        if best is not found.best:
+            moved_by = np.linalg.inv(found.best.matrix) @ best.matrix
+            others = tuple(other @ moved_by for other in found.others)
+            ratio = explained(best, found.inlier_mm)
+            found = replace(found, best=best, others=others, explained_ratio=ratio)
     return _registration(scan, found, options)
 
 

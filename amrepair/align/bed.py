@@ -10,7 +10,7 @@ import numpy as np
 from amrepair.align.options import DEFAULT_ALIGN, BedOptions
 from amrepair.align.refine import Prior
 from amrepair.arrays import Matrix, Points
-from amrepair.frames import moved, rigid, rotation_from_vector
+from amrepair.frames import moved, rigid, rotation_from_vector, turn_between
 from amrepair.template.port import Template
 
 
@@ -56,9 +56,7 @@ def level_on_bed(
         scale = max(options.last_scale_mm, scale * options.shrink)
     normal = np.array([-fit[0], -fit[1], 1.0])
     normal /= np.linalg.norm(normal)
-    axis = np.cross(normal, [0.0, 0.0, 1.0])
-    turn = rotation_from_vector(axis * (np.arcsin(min(1.0, float(np.linalg.norm(axis))))
-                                        / max(float(np.linalg.norm(axis)), 1e-12)))  # fmt: skip
+    turn = rotation_from_vector(turn_between(normal, np.array([0.0, 0.0, 1.0])))
     pivot = np.array([*centre[:2], bed_z_mm + fit[2]])
     level = rigid(turn, pivot - turn @ pivot - np.array([0.0, 0.0, fit[2]]))
     return level @ matrix, True

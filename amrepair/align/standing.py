@@ -11,7 +11,7 @@ import numpy as np
 
 from amrepair.arrays import Box, Matrix, Vector
 from amrepair.errors import AlignmentError
-from amrepair.frames import Transform, box_of, motion_about, unit_vectors
+from amrepair.frames import Transform, box_of, motion_about, turn_between, unit_vectors
 from amrepair.template.port import Template
 from gcode.meshes import mesh_of
 from gcode.profiles import PrinterProfile
@@ -52,10 +52,7 @@ def stood_up(template: Template, matrix: Matrix, about_mm: Vector, most_rad: flo
     _, face = np.unique(np.round(outward[near], 4), axis=0, return_inverse=True)
     area = np.bincount(face.ravel(), np.linalg.norm(across[near], axis=1))
     foot = outward[near[np.argmax(face.ravel() == np.argmax(area))]]
-    axis = np.cross(down, foot)
-    sine = float(np.linalg.norm(axis))
-    turn = axis * (np.arcsin(min(sine, 1.0)) / max(sine, 1e-12))
-    return motion_about(about_mm, turn, np.zeros(3)) @ matrix
+    return motion_about(about_mm, turn_between(down, foot), np.zeros(3)) @ matrix
 
 
 def refuse_impossible(
