@@ -12,6 +12,7 @@ from typing import Any
 import manifold3d
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import ndimage
 
 from amrepair.arrays import Box, HeightMap
 from amrepair.errors import InputError
@@ -140,6 +141,27 @@ class IntervalMap:
         low = (x0 + ix.min() * cell, y0 + iy.min() * cell, self.spans_mm[:, 0].min())
         high = (x0 + (ix.max() + 1) * cell, y0 + (iy.max() + 1) * cell, self.spans_mm[:, 1].max())
         return np.array([low, high])
+
+    def apart_mm(self, margin_mm: float) -> Float[np.ndarray, "k 2 3"]:
+        """Boxes of what stands apart: a part, the line that primes the nozzle at the bed's edge.
+
+        What is not more than two margins from one another is in one box. The boxes are in the
+        build frame, without the margin.
+        """
+        ny, nx = self.window.shape
+        filled = (np.diff(self.offsets) > 0).reshape(ny, nx)
+        reach = 2 * round(margin_mm / self.window.cell_mm) + 1
+        near = ndimage.maximum_filter(filled, size=reach, mode="constant")
+        labels, _ = ndimage.label(near, structure=np.ones((3, 3), dtype=bool))
+        labels[~filled] = 0
+        top_mm, corner_mm = self.top_mm(), np.array(self.window.corner_mm)
+        boxes = []
+        for label, (rows, columns) in enumerate(ndimage.find_objects(labels), start=1):
+            high_mm = top_mm[rows, columns][labels[rows, columns] == label].max()
+            low = corner_mm + self.window.cell_mm * np.array([columns.start, rows.start])
+            high = corner_mm + self.window.cell_mm * np.array([columns.stop, rows.stop])
+            boxes.append([[*low, 0.0], [*high, high_mm]])
+        return np.array(boxes).reshape(-1, 2, 3)
 
     def _meet(self, other: IntervalMap) -> None:
         if self.window != other.window:

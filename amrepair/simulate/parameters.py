@@ -143,7 +143,7 @@ class ScannerModel(_Part):
     spot_half_height_mm
         Half the height of the spot that a point averages over.
     bed_margin_mm
-        How much of the bed around the part is measured.
+        How much of the bed around each thing that stands on it is measured.
     dropout_ratio
         Share of the points on square surface that do not come back; it grows as 1 / cos a, since
         less light returns from a slope.

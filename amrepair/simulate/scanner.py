@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.arrays import Box, HeightMap, Mask, Numbers, Points, Values, Vector
+from amrepair.arrays import HeightMap, Mask, Numbers, Points, Values, Vector
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform, in_box, rotation_from_vector, unit_vectors
 from amrepair.scans.scan import Scan
@@ -187,9 +187,10 @@ class SimulatedScanner:
                 f"{bounds[1, 2]:.1f} mm high; put the sensors higher"
             )
         top_mm = np.ascontiguousarray(solid.top_mm())
+        boxes = solid.apart_mm(self.model.bed_margin_mm)
         clouds, indices = [], []
         for index, sensor in enumerate(self._sensors_mm):
-            targets = self._targets(sensor, bounds)
+            targets = self._targets(sensor, boxes)
             points, normals, kinds = cast(
                 solid.offsets,
                 solid.spans_mm,
@@ -202,7 +203,7 @@ class SimulatedScanner:
             )
             rays = unit_vectors(points - sensor)
             cosine = -np.einsum("ij,ij->i", rays, normals)
-            seen = self._measured(points, cosine, kinds, bounds)
+            seen = self._measured(points, cosine, kinds, boxes)
             seen &= self._unhidden(solid, top_mm, sensor, points)
             if self._replay is None:
                 noise = self._noise(rays, cosine)[seen]
@@ -228,28 +229,37 @@ class SimulatedScanner:
             source=f"simulated:{request.label}",
         )
 
-    def _targets(self, sensor: Vector, bounds: Box) -> Points:
-        """(n, 3) points of the bed that rays aim at: the part's shadow and a margin, dithered."""
+    def _targets(self, sensor: Vector, boxes: Float[np.ndarray, "k 2 3"]) -> Points:
+        """(n, 3) points of the bed that rays aim at: the boxes' shadows and a margin, dithered."""
         margin_mm = self.model.bed_margin_mm
-        low, high = bounds[0, :2] - margin_mm, bounds[1, :2] + margin_mm
-        stretch = sensor[2] / (sensor[2] - bounds[1, 2])  # a point at the top, cast on the bed
-        corners = np.stack([low, high, sensor[:2] + stretch * (low - sensor[:2])])
-        corners = np.concatenate([corners, [sensor[:2] + stretch * (high - sensor[:2])]])
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        low, high = boxes[:, 0, :2] - margin_mm, boxes[:, 1, :2] + margin_mm
+        # The edges of a box's top, cast on the bed.
+        stretch = sensor[2] / (sensor[2] - boxes[:, 1, 2:])
+        cast_low, cast_high = sensor[:2] + stretch * [low - sensor[:2], high - sensor[:2]]
+        low, high = np.minimum(low, cast_low), np.maximum(high, cast_high)
         spacing_mm = self.model.spacing_mm
-        x = np.arange(low[0], high[0], spacing_mm)
         step_mm = self.model.line_step_mm or spacing_mm
-        y = np.arange(low[1], high[1], step_mm)
-        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        grid = grid + self._rng.uniform(0.0, 1.0, grid.shape) * [spacing_mm, step_mm]
+        x = np.arange(low[:, 0].min(), high[:, 0].max(), spacing_mm)
+        y = np.arange(low[:, 1].min(), high[:, 1].max(), step_mm)
+        asked = np.zeros((len(y), len(x)), dtype=bool)
+        for one_low, one_high in zip(low, high, strict=True):
+            x0, x1 = np.searchsorted(x, [one_low[0] - spacing_mm, one_high[0]], "right")
+            y0, y1 = np.searchsorted(y, [one_low[1] - step_mm, one_high[1]], "right")
+            asked[y0:y1, x0:x1] = True
+        rows, columns = np.nonzero(asked)
+        grid = np.stack([x[columns], y[rows]], axis=-1)
+        grid += self._rng.uniform(0.0, 1.0, grid.shape) * [spacing_mm, step_mm]
         return np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
 
-    def _measured(self, points: Points, cosine: Values, kinds: Numbers, bounds: Box) -> Mask:
+    def _measured(
+        self, points: Points, cosine: Values, kinds: Numbers, boxes: Float[np.ndarray, "k 2 3"]
+    ) -> Mask:
         """(n,) which points send enough light back, and are asked for."""
         margin_mm = self.model.bed_margin_mm
-        low, high = bounds[0, :2] - margin_mm, bounds[1, :2] + margin_mm
-        near = in_box(points[:, :2], low, high)
-        keep = (cosine > np.cos(self.model.max_incidence_rad)) & ((kinds != BED) | near)
+        near = kinds != BED
+        for low, high in boxes[:, :, :2]:
+            near |= in_box(points[:, :2], low - margin_mm, high + margin_mm)
+        keep = (cosine > np.cos(self.model.max_incidence_rad)) & near
         if self.model.dropout_ratio > 0:
             lost = self.model.dropout_ratio / np.maximum(cosine, 0.1)
             keep &= self._rng.random(len(points)) >= lost
