@@ -66,6 +66,21 @@ def test_walls_and_top_are_seen_where_they_are(turn_deg: float) -> None:
             assert wall.mean() == pytest.approx(half, abs=0.064 if turn_deg == 0 else 0.015)
 
 
+def test_no_bed_is_measured_between_what_stands_apart() -> None:
+    # regression: one box held a part and the line that primes the nozzle at the bed's other edge
+    world, _ = box_world(0.0)
+    alone = len(seen_in_build(scanner(world)))
+    world.add(m3.Manifold.cube((1, 50, 0.2)).translate((1, 5, 0)))
+    world.add(m3.Manifold.cube((50, 1, 0.2)).translate((5, 1, 0)))
+    points = seen_in_build(scanner(world))
+    margin_mm = ScannerModel().bed_margin_mm
+    beside = np.abs(points[:, :2] - CENTRE).max(axis=1) < 8.0 + margin_mm - 0.5
+    assert np.count_nonzero(beside) == pytest.approx(alone, rel=0.05)
+    between = ~beside & (points[:, :2] > 8.5 + margin_mm).all(axis=1)
+    between &= (points[:, :2] < 53.0).all(axis=1)
+    assert np.count_nonzero(between & (points[:, 2] < 0.05)) == 0
+
+
 def test_what_no_ray_reaches_is_not_seen() -> None:
     world = World((60.0, 60.0))
     world.add(m3.Manifold.cube((10, 10, 2)).translate((25, 25, 10)))  # a plate in the air
