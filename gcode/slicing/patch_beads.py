@@ -19,6 +19,7 @@ from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job_lines import JobPieces, gathered
 from gcode.slicing.medial import fill_thin
 from gcode.slicing.options import FillOptions, PatchOptions
+from gcode.slicing.patch_middles import FreeBetween, in_the_middle, left_of
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
@@ -150,6 +151,13 @@ class _Shares:
         """By piece; of nothing `bincount` makes integers."""
         return np.bincount(self.piece, of_column, minlength=self.tree.n).astype(np.float64)
 
+    def off_mm(self, runs: list[Bead], model: PatchModel) -> Float[np.ndarray, " m"]:
+        """How far to the left of each piece the middle of its columns lies."""
+        left = np.concatenate([left_of(run.xy_mm) for run in runs])
+        away_mm = model.points_mm[self.columns] - self.middle_mm[self.piece]
+        number = np.bincount(self.piece, minlength=self.tree.n)
+        return self.sums((away_mm * left[self.piece]).sum(axis=1)) / np.maximum(number, 1)
+
     @property
     def deep_mm(self) -> Float[np.ndarray, " m"]:
         """What the columns of each piece want on average."""
@@ -166,12 +174,14 @@ def weighed(
     setup: PrintSetup,
     *,
     job: JobPieces | None = None,
+    free: FreeBetween | None = None,
 ) -> tuple[list[Chain], Float[np.ndarray, "ny nx"]]:
     """Cross-sections such that every column's thickness goes to the nearest piece of a bead.
 
     So plastic is the volume that is missing, to the column. The tip is as high along each run as
-    `tips_mm` says; where the runs are the job's own lines, `job` tells of their pieces. Returns
-    the chains, and the thickness that columns get: none beyond where a bead can spread (farther in
+    `tips_mm` says; where the runs are the job's own lines, `job` tells of their pieces. Where
+    `free` says where the nozzle may go, beads lie in the middle of what they fill. Returns the
+    chains, and the thickness that columns get: none beyond where a bead can spread (farther in
     `strips` along walls), less where a bead would be too wide.
     """
     options = model.options
@@ -191,6 +201,7 @@ def weighed(
             options.lines,
         )
         own, met = job.section_mm2, met_mm3 / np.maximum(told_mm3, 1e-9)
+    off_mm = shares.off_mm(runs, model) if free is not None else None
     chains: list[Chain] = []
     given = np.zeros(len(volume))  # share of what its columns want that a piece lays
     at = 0
@@ -203,11 +214,26 @@ def weighed(
         deep = np.maximum(depth[mine], options.beads.least_thick_mm)
         most = _most_section(deep, options.beads.bond_ratio * own[mine], setup, model.options.fill)
         given[mine] = np.minimum(1.0, most / np.maximum(section, 1e-9)) * met[mine]
-        section = np.minimum(section, most)
-        chains += _split(Chain(run.xy_mm, tip_mm, section, deep, run.role), options)
+        section, xy_mm = np.minimum(section, most), run.xy_mm
+        if free is not None and off_mm is not None and run.role is not Role.BRIDGE:
+            xy_mm = in_the_middle(run, off_mm[mine], free)
+            section = _as_much(section, run.xy_mm, xy_mm, setup)
+        chains += _split(Chain(xy_mm, tip_mm, section, deep, run.role), options)
     laid = np.zeros(thick.size)
     laid[shares.columns] = shares.thick_mm * given[shares.piece]
     return chains, laid.reshape(thick.shape)
+
+
+def _as_much(
+    section_mm2: Float[np.ndarray, " n"],
+    drawn_mm: Float[np.ndarray, "m 2"],
+    xy_mm: Float[np.ndarray, "m 2"],
+    setup: PrintSetup,
+) -> Float[np.ndarray, " n"]:
+    """Cross-sections with which moved pieces carry as much as they were to carry as drawn."""
+    before_mm, length_mm = (np.hypot(*np.diff(xy, axis=0).T) for xy in (drawn_mm, xy_mm))
+    section_mm2 = section_mm2 * before_mm / np.maximum(length_mm, 1e-9)
+    return np.asarray(np.minimum(section_mm2, setup.printer.max_bead_section_mm2))
 
 
 def _most_section(

@@ -15,6 +15,7 @@ from gcode.slicing.patch_bridges import Bridges, Holds
 from gcode.slicing.patch_due import Due, due_at, due_of_job, hemmed, strips_along_walls
 from gcode.slicing.patch_free import eased, free_between, free_runs
 from gcode.slicing.patch_heights import Height
+from gcode.slicing.patch_middles import PlanarPoints
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.patch_skin import Skin
 from gcode.slicing.patch_state import PatchState
@@ -208,13 +209,17 @@ def _along_own(
     thick, bridges = np.where(due.alone, 0.0, due.thick_mm), due.bridges
     rest = np.where(bridges.over | bridges.ends, 0.0, thick)
     drawn = draw(rest, at.reach, SOLID_ANGLES_RAD[at.index % 2], model, setup)
+
+    def free(start_mm: PlanarPoints, end_mm: PlanarPoints) -> Bool[np.ndarray, " _m"]:
+        return free_between(start_mm, end_mm, at.reach, model.reach)
+
     runs = [
         *bridges.strands,
         *(
             begun_inside(run, model)
             for bead in eased(drawn, at.reach, model.reach)
-            for free in free_runs(bead, lambda a, b: free_between(a, b, at.reach, model.reach))
-            for run in (holds.held(free) if holds is not None else (free,))
+            for part in free_runs(bead, free)
+            for run in (holds.held(part) if holds is not None else (part,))
         ),
     ]
     if not runs:
@@ -223,7 +228,7 @@ def _along_own(
         thick = holds.floored(runs, thick)
     tips_mm = [np.full(len(run.xy_mm), at.z_mm) for run in runs]
     strips = strips_along_walls(thick, at.z_mm, model, state)
-    chains, laid = weighed(runs, tips_mm, thick, strips, model, setup)
+    chains, laid = weighed(runs, tips_mm, thick, strips, model, setup, free=free)
     return _Laying(chains, laid, _served(laid, due.thick_mm), float(thick[thick > 0].mean()))
 
 
