@@ -16,7 +16,7 @@ from shapely.geometry import MultiPoint, Point
 
 from amrepair.errors import InputError
 from amrepair.repair import RepairPlan, Site
-from gcode.meshes import box_of_solid
+from gcode.meshes import box_of_solid, middle_of_mass
 from gcode.profiles import PrintSetup
 from gcode.progress import Progress, silent
 from gcode.slicing.layers import LayerGrid
@@ -150,9 +150,5 @@ def _stands(solid: manifold3d.Manifold) -> bool:
     if foot.is_empty():
         return False
     hull = MultiPoint(np.concatenate([np.asarray(c) for c in foot.to_polygons()])).convex_hull
-    mesh = solid.to_mesh64()
-    corners = np.asarray(mesh.vert_properties)[:, :3][np.asarray(mesh.tri_verts, dtype=np.int64)]
-    # The centre of mass is that of signed tetrahedra from the origin.
-    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    centre = (volume[:, None] * corners.sum(axis=1)).sum(axis=0) / (4.0 * volume.sum())
-    return bool(hull.buffer(-TIPPING_MM).contains(Point(float(centre[0]), float(centre[1]))))
+    x_mm, y_mm, _ = middle_of_mass(solid)
+    return bool(hull.buffer(-TIPPING_MM).contains(Point(float(x_mm), float(y_mm))))

@@ -115,6 +115,15 @@ def box_of_solid(solid: Any) -> Float[np.ndarray, "2 3"]:
     return np.array(solid.bounding_box()).reshape(2, 3)
 
 
+def middle_of_mass(solid: Any) -> Float[np.ndarray, " 3"]:
+    """(3,) middle of mass of a solid, as full of plastic everywhere: of signed tetrahedra."""
+    vertices, faces = mesh_of(solid)
+    origin = vertices.mean(axis=0)
+    corners = (vertices - origin)[faces]
+    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    return np.asarray(origin + volume @ corners.sum(axis=1) / (4.0 * volume.sum()))
+
+
 def closed_mesh(solid: Any) -> ClosedMesh:
     """The mesh of a `manifold3d.Manifold`."""
     if isinstance(solid, ClosedMesh):

@@ -8,18 +8,21 @@ before any work.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
-from amrepair.arrays import Box, Matrix, Vector
+from amrepair.arrays import Box, Mask, Matrix, Points, Vector
 from amrepair.errors import AlignmentError
 from amrepair.frames import Transform, box_of, motion_about, turn_between, unit_vectors
 from amrepair.template.port import Template
-from gcode.meshes import mesh_of
+from gcode.meshes import mesh_of, middle_of_mass
 from gcode.profiles import PrinterProfile
 
 # More than any calibration, raft or warp puts a part off; less than any layer it would be moved by.
 SLACK_MM = 1.0
 # Thicker than slicers lay rafts (Cura's and PrusaSlicer's usual ones are 0.8 to 2.5 mm).
 RAFT_MM = 3.0
+# Less is rounding: two faces this far apart are one, 0.05 mm over a part of 250 mm.
+ROUNDED_RAD = 2e-4
 
 
 def box_on_bed(template: Template, placed: Transform) -> Box:
@@ -31,6 +34,10 @@ def box_on_bed(template: Template, placed: Transform) -> Box:
 def stood_up(template: Template, matrix: Matrix, about_mm: Vector, most_rad: float) -> Matrix:
     """A pose without its lean: the part stands on the face of its hull that is nearly down.
 
+    A face stands that has the part's middle above it, so no facet of a fillet beside the foot
+    does. Where one could stand on either side of what is down, the foot is round and the part
+    rolls: there is no lean to take, and the pose stays.
+
     Parameters
     ----------
     matrix
@@ -40,19 +47,34 @@ def stood_up(template: Template, matrix: Matrix, about_mm: Vector, most_rad: flo
     most_rad
         What leans by more is another pose, as of a part on a fixture, and stays as it is.
     """
-    vertices, faces = mesh_of(template.solid().hull())
-    a, b, c = np.asarray(vertices, dtype=np.float64)[np.asarray(faces).T]
-    across = np.cross(b - a, c - a)
+    solid = template.solid()
+    vertices, faces = mesh_of(solid.hull())
+    corners = np.asarray(vertices, dtype=np.float64)[np.asarray(faces)]  # (n, 3, 3)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = unit_vectors(across)
     down = -matrix[:3, 2]
-    near = np.flatnonzero(outward @ down > np.cos(most_rad))
-    if not len(near):
+    near = outward @ down > np.cos(most_rad)
+    if not near.any():
         return matrix
+    corners, across, outward = corners[near], across[near], outward[near]
     # the triangles of one face have one normal, but for rounding
-    _, face = np.unique(np.round(outward[near], 4), axis=0, return_inverse=True)
-    area = np.bincount(face.ravel(), np.linalg.norm(across[near], axis=1))
-    foot = outward[near[np.argmax(face.ravel() == np.argmax(area))]]
+    _, face = np.unique(np.round(outward, 4), axis=0, return_inverse=True)
+    area = np.bincount(face.ravel(), np.linalg.norm(across, axis=1))[face.ravel()]
+    standing = _is_under(corners, outward, middle_of_mass(solid))
+    if not standing.any():  # it stands since it sticks
+        standing = np.ones_like(standing)
+    turns = np.cross(down, outward[standing])
+    if (turns @ turns.T).min() < -(ROUNDED_RAD**2):
+        return matrix
+    foot = outward[standing][np.argmax(area[standing])]
     return motion_about(about_mm, turn_between(down, foot), np.zeros(3)) @ matrix
+
+
+def _is_under(corners_mm: Float[np.ndarray, "n 3 3"], outward: Points, middle_mm: Vector) -> Mask:
+    """(n,) whether a middle is over each triangle, along the triangle's own normal."""
+    sides = np.roll(corners_mm, -1, axis=1) - corners_mm
+    inward = np.cross(outward[:, None], sides)
+    return np.asarray(((middle_mm - corners_mm) * inward).sum(axis=2).min(axis=1) >= 0.0)
 
 
 def refuse_impossible(

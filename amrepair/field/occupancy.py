@@ -27,6 +27,7 @@ from amrepair.field.labelling import (
 )
 from amrepair.field.minimum_cut import facets_of
 from amrepair.field.near import has_near
+from amrepair.field.one_view import in_view_from, is_in_view, ways_of_view, ways_past
 from amrepair.field.options import OccupancyOptions
 from amrepair.field.space import (
     Broken,
@@ -156,6 +157,13 @@ def _guessed(
         scanned[side] = _marked(void, index[known])
     if not ends.any():
         return np.zeros_like(void)
+    edge_mm = 1.5 * scan.options.seen_spacings * scan.spacing_mm
+    ways = ways_of_view(scan.template, surface, edge_mm, scan.options.one_view)
+    if len(ways):
+        ways = ways_past(ways, void, scan, grid)
+        in_view = _in_one_view(void, ways, scan, grid)
+        in_view |= _looked_into(void, scanned, surface, ways, scan, grid)
+        return void & ~in_view
     (box,) = ndimage.find_objects(void.astype(np.int8))
     # a gap in what was scanned of an end, no wider than points are asked for, is chance
     across = 2 * math.ceil(width_mm / grid.voxel_mm) + 1
@@ -174,14 +182,41 @@ def _guessed(
     # past the border of what was scanned of an end both are as near, as far as its points tell it
     guessed[box] &= to_guess < to_known + width_mm / grid.voxel_mm
     if guessed.any():
-        guessed &= ~_looked_into(void, scanned, surface, scan, grid)
+        guessed &= ~_looked_into(void, scanned, surface, ways, scan, grid)
     return guessed
+
+
+def _in_one_view(
+    void: VoxelMask, ways: Float[np.ndarray, "k 3"], scan: ScannedSpace, grid: VoxelGrid
+) -> VoxelMask:
+    """What is empty and in view, as far as to an end that was scanned, from most of the ways.
+
+    Through a face that a way grazes nobody knows what would have been seen: it says nothing.
+    """
+    hull = _hull_of(np.concatenate([scan.on_mm, scan.broken.place_mm]))
+    width_mm = scan.width_mm(grid.voxel_mm)
+    known_from, told_from = np.zeros(void.shape, np.int64), np.zeros(void.shape, np.int64)
+    options = scan.options
+    for way in ways:
+        index, mouth_mm, end_mm, through = in_view_from(way, void, scan, grid)
+        # where nothing was scanned behind it the scanner's view may have ended
+        known = through & _amid(mouth_mm, hull, options.hole_mm)
+        known |= has_near(end_mm, scan.broken.place_mm, width_mm)
+        feet_mm, _ = feet_on(scan.template, end_mm)
+        film = np.linalg.norm(end_mm - feet_mm, axis=1) < width_mm
+        known |= film & scan.sees(feet_mm)
+        told = feet_on(scan.template, mouth_mm)[1] @ way > options.one_view.least_facing
+        known_from[tuple(index[known & told].T)] += 1
+        told_from += 1
+        told_from[tuple(index[known & ~told].T)] -= 1
+    return (known_from > 0) & (2 * known_from >= told_from)
 
 
 def _looked_into(
     void: VoxelMask,
     scanned: dict[tuple[int, int], VoxelMask],
     surface: tuple[Points, Points, Mask],
+    ways: Float[np.ndarray, "k 3"],
     scan: ScannedSpace,
     grid: VoxelGrid,
 ) -> VoxelMask:
@@ -202,6 +237,8 @@ def _looked_into(
         known = way * feet_on(scan.template, middle_mm)[1][:, axis] > LEAST_FACING
         known &= ~has_near(middle_mm, places_mm[toward], within_mm)
         known[known] = _amid(middle_mm[known], hull, scan.options.hole_mm)
+        if len(ways):
+            known[known] = is_in_view(scan.template, middle_mm[known], ways, scan.options.one_view)
         mouths[axis, way] = _marked(void, index), _marked(void, index[known])
     for (axis, way), (_, known) in mouths.items():
         through, _ = mouths[axis, -way]

@@ -24,6 +24,48 @@ class SurfelOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class OneViewOptions:
+    """When a bare cloud counts as one view, and how its way is looked for.
+
+    Attributes
+    ----------
+    places
+        So many of the template's surface tell the way.
+    ways, tried
+        Ways that are compared by what faces them (9° apart), and of how many of those it is then
+        told what of the template lies before its surface.
+    finer_rad, finer_ways
+        Around the best of them so many more are tried, within these, one after the other.
+    least_facing
+        Cosine of what a scanner sees for certain: it may miss what it looks at more aslant.
+    off_mm
+        So far before its surface a line of sight begins, and no step along it is shorter.
+    most_hidden_seen
+        Of what one view cannot have seen no more seems to be seen, the edge of what was apart.
+        (Nine cuts in printed parts: 0.004 at most of one view.)
+    as_good
+        Ways that tell this share of what the best tells may as well be the one: of a block every
+        way from which three faces are seen.
+    enough_ways
+        So many of those that are spread evenly do, without finer ones.
+    squarely
+        Cosine of a line of sight and a scanned surface's normal that it ends at.
+    """
+
+    places: int = 1500
+    ways: int = 500
+    tried: int = 60
+    finer_rad: tuple[float, ...] = (0.15, 0.08, 0.04)
+    finer_ways: int = 24
+    least_facing: float = 0.25
+    off_mm: float = 0.3
+    most_hidden_seen: float = 0.02
+    as_good: float = 0.98
+    enough_ways: int = 4
+    squarely: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
 class OccupancyOptions:
     """What the labelling is set to.
 
@@ -54,6 +96,8 @@ class OccupancyOptions:
         So many bare places make a hole, and so many broken ones are asked what they look out of.
     box_ratio
         A box holds at most so many times as many voxels as are to be labelled.
+    one_view
+        When all was seen from one way.
     """
 
     voxel_spacings: float = 1.5
@@ -72,6 +116,7 @@ class OccupancyOptions:
     hole_places: int = 5
     looking_places: int = 2000
     box_ratio: float = 30.0
+    one_view: OneViewOptions = field(default_factory=OneViewOptions)
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,3 +82,31 @@ def test_a_pose_is_stood_up_on_the_face_that_is_nearly_down(turned: np.ndarray) 
     assert turned_rad(found[:3, :3] @ leaning[:3, :3].T) < 0.04
     far = lean @ lean @ leaning
     assert stood_up(PART, far, np.zeros(3), np.deg2rad(3.0)) is far
+
+
+def disc(facets: int, turned_deg: float) -> MeshSdf:
+    """A round plate on its rim, 60 mm across and 8 mm thick, with a hole aside of its middle."""
+    across = m3.Manifold.cylinder(8.0, 30.0, 30.0, facets).rotate((0.0, 0.0, turned_deg))
+    hole = m3.Manifold.cylinder(10.0, 4.0, 4.0, 64).translate((-15.0, -12.0, -1.0))
+    return MeshSdf.from_mesh(solid_mesh((across - hole).rotate((90.0, 0.0, 0.0))))
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 1.0])
+def test_a_round_rim_has_no_face_to_stand_on(turned_deg: float) -> None:
+    # regression: a crop of a disc that stood on its rim was turned by 2 degrees, onto the largest
+    # of its rim's equal facets, then "has come off and moved"
+    round_part = disc(180, turned_deg)
+    pose = motion_about(np.zeros(3), np.array([0.0, 1e-3, 0.0]), np.zeros(3))
+    found = stood_up(round_part, pose, np.zeros(3), np.deg2rad(3.0))
+    assert np.rad2deg(turned_rad(found[:3, :3] @ pose[:3, :3].T)) < STANDS.upright_deg
+
+
+def test_a_round_foot_beside_a_flat_one_is_not_stood_on() -> None:
+    foot = m3.Manifold.cube((10.0, 30.0, 20.0)).translate((3.0, 0.0, 0.0))
+    rims = m3.Manifold.cylinder(30.0, 3.0, 3.0, 360).rotate((-90.0, 0.0, 0.0))
+    rounded = foot + rims.translate((3.0, 0.0, 3.0)) + rims.translate((13.0, 0.0, 3.0))
+    part = MeshSdf.from_mesh(solid_mesh(rounded))
+    for lean_rad in (0.035, -0.035):
+        pose = motion_about(np.zeros(3), np.array([0.0, lean_rad, 0.0]), np.zeros(3))
+        found = stood_up(part, pose, np.array([8.0, 15.0, 10.0]), np.deg2rad(3.0))
+        assert np.abs(found[:3, 2]).max() == pytest.approx(1.0, abs=1e-6)

@@ -212,7 +212,7 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
             options=OccupancyOptions(least_seen=least_seen),
         )
         emptied_mm3.append(float((found.designed & ~found.solid).sum()) * found.voxel_mm**3)
-    assert emptied_mm3[0] > 4_000.0  # what the labels alone would say
+    assert emptied_mm3[0] > 1_000.0  # what the labels alone would say of what is in view
     assert emptied_mm3[1] == 0.0
 
 
