@@ -161,6 +161,7 @@ def _guessed(
     ways = ways_of_view(scan.template, surface, edge_mm, scan.options.one_view)
     if len(ways):
         ways = ways_past(ways, void, scan, grid)
+    if len(ways):
         in_view = _in_one_view(void, ways, scan, grid)
         in_view |= _looked_into(void, scanned, surface, ways, scan, grid)
         return void & ~in_view

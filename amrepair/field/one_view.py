@@ -119,12 +119,18 @@ def is_in_view(
 def ways_past(
     ways: Float[np.ndarray, "k 3"], void: VoxelMask, scan: ScannedSpace, grid: VoxelGrid
 ) -> Float[np.ndarray, "m 3"]:
-    """Those of the ways from which most of what is broken can be seen past what stands."""
+    """Those of the ways from which most of what is broken can be seen past what stands.
+
+    None where that is less than half of it from any of them: it was seen from elsewhere. What is
+    left of a print that stopped early shows the template's underside and a break that faces up.
+    """
     broken_mm, options = scan.broken.place_mm, scan.options.one_view
     some_mm = broken_mm[:: len(broken_mm) // options.places + 1]
     share = np.array(
         [_toward(way, void, np.zeros_like(void), grid, some_mm)[0].mean() for way in ways]
     )
+    if share.max() < options.least_past:
+        return np.zeros((0, 3))
     return ways[share >= options.as_good * share.max()]
 
 

@@ -48,6 +48,9 @@ class OneViewOptions:
         way from which three faces are seen.
     enough_ways
         So many of those that are spread evenly do, without finer ones.
+    least_past
+        Of what is broken so much at least is seen past what stands from a way that all was seen
+        from: more than half.
     squarely
         Cosine of a line of sight and a scanned surface's normal that it ends at.
     """
@@ -62,6 +65,7 @@ class OneViewOptions:
     most_hidden_seen: float = 0.02
     as_good: float = 0.98
     enough_ways: int = 4
+    least_past: float = 0.5
     squarely: float = 0.5
 
 
