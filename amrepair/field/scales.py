@@ -2,9 +2,7 @@
 
 From scale to scale cells double in width. The value of a wider cell is the median of the cells in
 it, and a window is a cell with those neighbours that face the same way, so that the two sides of a
-thin wall are not mixed. Nor are two sheets that lie above one another: where a print stopped after
-1 mm, the break and the foot are as near to the same surface of the template. This module measures;
-`regions` decides what is significant.
+thin wall are not mixed. This module measures; `regions` decides what is significant.
 """
 
 from __future__ import annotations
@@ -21,11 +19,6 @@ from amrepair.frames import cells_of, unit_vectors
 # Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
 # of a wall and the faces of an edge are not.
 WINDOW_FACING = 0.5
-# Noise puts cells of one surface above one another by less than so many cells of the first scale.
-SHEETS_CELLS = 0.5
-# Of two sheets that lie above one another each has such a share of the points: it is at least a
-# third as dense as the other. What is sparser strays.
-LEAST_SHEET = 0.25
 # The third lowest and third highest cell of a window count: three cells are a surface, two chance.
 RANK = 3
 # The weight of a cell of stray points: it keeps its place, but hardly counts in windows around it.
@@ -127,7 +120,7 @@ def scales_of(
     inner = (place_mm, normal, value_mm, weight.astype(np.float64), alone)
     size_mm = cell_mm
     while True:
-        scale = _scale(of_base, *inner, size_mm, SHEETS_CELLS * cell_mm, medians=bool(found))
+        scale = _scale(of_base, *inner, size_mm, medians=bool(found))
         found.append(scale)
         if 2.0 * 3.0 * size_mm > widest_mm or len(scale) <= kernels.MOST_NEIGHBOURS:
             return tuple(found)
@@ -149,14 +142,11 @@ def _scale(
     weight: Values,
     apart: Mask,
     cell_mm: float,
-    gap_mm: float,
     *,
     medians: bool,
 ) -> Scale:
     """Group the cells of the narrower scale to wider ones, and form their windows."""
-    order, start, keys, strides = _grouped(
-        place_mm, normal, value_mm, weight, apart, cell_mm, gap_mm
-    )
+    order, start, keys, strides = _grouped(place_mm, normal, apart, cell_mm)
     group = np.empty(len(order), np.int64)
     group[order] = np.repeat(np.arange(len(start) - 1), np.diff(start))
     first = start[:-1]
@@ -168,9 +158,7 @@ def _scale(
         if medians
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )
-    table, count = kernels.neighbours(
-        keys, *strides, facing, value, total, WINDOW_FACING, 0.5 * cell_mm, gap_mm, LEAST_SHEET
-    )
+    table, count = kernels.neighbours(keys, *strides, facing, value, WINDOW_FACING, 0.5 * cell_mm)
     median, low, high, noise, around = kernels.window_statistics(
         table, count, place, value, total, RANK
     )
@@ -203,18 +191,9 @@ def ways_of(normal: Points) -> Numbers:
 
 
 def _grouped(
-    place_mm: Points,
-    normal: Points,
-    value_mm: Values,
-    weight: Values,
-    apart: Mask,
-    cell_mm: float,
-    gap_mm: float,
+    place_mm: Points, normal: Points, apart: Mask, cell_mm: float
 ) -> tuple[Numbers, Int[np.ndarray, " s1"], Int[np.ndarray, " s"], tuple[int, int]]:
-    """Sort cells by the wider cell that holds them: order, where each begins, keys, strides.
-
-    Two sheets in one cell are two groups with the same key.
-    """
+    """Sort cells by the wider cell that holds them: order, where each begins, keys, strides."""
     index = cells_of(place_mm, place_mm.min(axis=0), cell_mm) + 1
     shape = index.max(axis=0) + 2
     strides = (int(shape[1] * shape[2]), int(shape[2]))
@@ -222,19 +201,5 @@ def _grouped(
     key = (index @ np.array([*strides, 1])) * kernels.SLOTS + way
     order = np.argsort(key, kind="stable")
     ranked = key[order]
-    begin = np.r_[True, ranked[1:] != ranked[:-1]]
-    first = np.flatnonzero(begin)
-    value = value_mm[order]
-    deep = np.maximum.reduceat(value, first) - np.minimum.reduceat(value, first) > gap_mm
-    if deep.any():
-        size = np.diff(np.append(first, len(ranked)))
-        which = np.flatnonzero(np.repeat(deep, size))
-        order[which] = order[which][np.lexsort((value[which], ranked[which]))]
-        below = np.cumsum(weight[order]) - weight[order]
-        below -= np.repeat(below[first], size)
-        share = below / np.repeat(np.add.reduceat(weight[order], first), size)
-        another = np.diff(value_mm[order], prepend=0.0) > gap_mm
-        another &= (share >= LEAST_SHEET) & (share <= 1.0 - LEAST_SHEET)
-        begin[which] |= another[which]
-    begins = np.flatnonzero(begin)
+    begins = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])
     return order, np.append(begins, len(ranked)), ranked[begins], strides

@@ -50,41 +50,8 @@ def _alike(normal, value, i, j, cosine, aside):
     return min(value[i], value[j]) > aside or max(value[i], value[j]) < -aside
 
 
-@njit(cache=True, nogil=True)
-def _of_one_sheet(cells, n, value, weight, own, gap, least):
-    """Keep of n cells the sheet that `own` lies in, if there are two: how many are kept.
-
-    Two sheets have a gap as wide between their values, as the break of a print that stopped has
-    from the foot that still stands under it, and either holds at least that share of the points:
-    what is sparser strays from the surface, and counts with it.
-    """
-    low = high = value[own]
-    wider = True
-    while wider:
-        wider = False
-        for k in range(n):
-            v = value[cells[k]]
-            if low - gap <= v < low:
-                low, wider = v, True
-            elif high < v <= high + gap:
-                high, wider = v, True
-    within, total = 0.0, 0.0
-    for k in range(n):
-        total += weight[cells[k]]
-        if low <= value[cells[k]] <= high:
-            within += weight[cells[k]]
-    if within == total or within < least * total or total - within < least * total:
-        return n
-    kept = 0
-    for k in range(n):
-        if low <= value[cells[k]] <= high:
-            cells[kept] = cells[k]
-            kept += 1
-    return kept
-
-
 @njit(cache=True, nogil=True, parallel=True)
-def neighbours(keys, stride_x, stride_y, normal, value, weight, cosine, aside, gap, least):
+def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
     """(s, MOST_NEIGHBOURS) cells around each, itself included; (s,) how many.
 
     `keys` are sorted cell numbers times SLOTS plus the way that the cell faces.
@@ -112,7 +79,7 @@ def neighbours(keys, stride_x, stride_y, normal, value, weight, cosine, aside, g
                         table[i, found] = j
                         found += 1
                     j += 1
-            count[i] = _of_one_sheet(table[i], found, value, weight, np.int64(i), gap, least)
+            count[i] = found
     return table, count
 
 

@@ -36,8 +36,6 @@ PARTS = {
     "with a sheet across its hole": m3.Manifold.cube((40, 40, 30))
     - (HOLE - m3.Manifold.cube((40, 40, 0.4)).translate((0, 0, 18))),
     "block": BLOCK,
-    # regression: one window held the break and the foot 1 mm under it: noise of 0.3 mm, none found
-    "frame": m3.Manifold.cube((60, 40, 5)) - m3.Manifold.cube((52, 32, 7)).translate((4, 4, -1)),
     # regression: of walls of 1.2 mm on samples 1.8 mm apart 0.78 was found
     "tall vase": m3.Manifold.cylinder(160, 24, 24, 96)
     - m3.Manifold.cylinder(160, 22.8, 22.8, 96).translate((0, 0, 1.2)),
@@ -52,7 +50,6 @@ CASES = [
     pytest.param("with a hollow above", 5.0, True, marks=pytest.mark.slow),
     ("with a sheet across its hole", 8.0, True),
     ("block", 2.0, False),
-    ("frame", 1.0, True),
     pytest.param("cylinder", 3.0, False, marks=pytest.mark.slow),
     pytest.param("block", 5.0, True, marks=pytest.mark.slow),
     ("block", 3.0, True),
