@@ -149,12 +149,7 @@ def _guessed(
     width_mm = scan.width_mm(grid.voxel_mm)
     for side, index, middle_mm in _facets_toward(void, designed & solid, grid):
         ends |= _marked(void, index)
-        known = has_near(middle_mm, scan.broken.place_mm, width_mm)
-        # a film's inner side may be told from the template's surface by no point
-        feet_mm, _ = feet_on(scan.template, middle_mm)
-        film = np.linalg.norm(middle_mm - feet_mm, axis=1) < width_mm
-        known |= film & scan.sees(feet_mm)
-        scanned[side] = _marked(void, index[known])
+        scanned[side] = _marked(void, index[_is_scanned(middle_mm, width_mm, scan)])
     if not ends.any():
         return np.zeros_like(void)
     edge_mm = 1.5 * scan.options.seen_spacings * scan.spacing_mm
@@ -162,8 +157,9 @@ def _guessed(
     if len(ways):
         ways = ways_past(ways, void, scan, grid)
     if len(ways):
-        in_view = _in_one_view(void, ways, scan, grid)
-        in_view |= _looked_into(void, scanned, surface, ways, scan, grid)
+        hull = _hull_of(scan)
+        in_view = _in_one_view(void, ways, hull, scan, grid)
+        in_view |= _looked_into(void, scanned, surface, ways, hull, scan, grid)
         return void & ~in_view
     (box,) = ndimage.find_objects(void.astype(np.int8))
     # a gap in what was scanned of an end, no wider than points are asked for, is chance
@@ -183,18 +179,31 @@ def _guessed(
     # past the border of what was scanned of an end both are as near, as far as its points tell it
     guessed[box] &= to_guess < to_known + width_mm / grid.voxel_mm
     if guessed.any():
-        guessed &= ~_looked_into(void, scanned, surface, ways, scan, grid)
+        hull = _hull_of(scan)
+        guessed &= ~_looked_into(void, scanned, surface, ways, hull, scan, grid)
     return guessed
 
 
+def _is_scanned(end_mm: Points, width_mm: float, scan: ScannedSpace) -> Mask:
+    """(n,) whether a void's ends were scanned, as broken surface or as the back of a film."""
+    broken = has_near(end_mm, scan.broken.place_mm, width_mm)
+    # a film's inner side may be told from the template's surface by no point
+    feet_mm, _ = feet_on(scan.template, end_mm)
+    film = np.linalg.norm(end_mm - feet_mm, axis=1) < width_mm
+    return np.asarray(broken | (film & scan.sees(feet_mm)))
+
+
 def _in_one_view(
-    void: VoxelMask, ways: Float[np.ndarray, "k 3"], scan: ScannedSpace, grid: VoxelGrid
+    void: VoxelMask,
+    ways: Float[np.ndarray, "k 3"],
+    hull: Float[np.ndarray, "h 4"],
+    scan: ScannedSpace,
+    grid: VoxelGrid,
 ) -> VoxelMask:
     """What is empty and in view, as far as to an end that was scanned, from most of the ways.
 
     Through a face that a way grazes nobody knows what would have been seen: it says nothing.
     """
-    hull = _hull_of(np.concatenate([scan.on_mm, scan.broken.place_mm]))
     width_mm = scan.width_mm(grid.voxel_mm)
     known_from, told_from = np.zeros(void.shape, np.int64), np.zeros(void.shape, np.int64)
     options = scan.options
@@ -202,10 +211,7 @@ def _in_one_view(
         index, mouth_mm, end_mm, through = in_view_from(way, void, scan, grid)
         # where nothing was scanned behind it the scanner's view may have ended
         known = through & _amid(mouth_mm, hull, options.hole_mm)
-        known |= has_near(end_mm, scan.broken.place_mm, width_mm)
-        feet_mm, _ = feet_on(scan.template, end_mm)
-        film = np.linalg.norm(end_mm - feet_mm, axis=1) < width_mm
-        known |= film & scan.sees(feet_mm)
+        known |= _is_scanned(end_mm, width_mm, scan)
         told = feet_on(scan.template, mouth_mm)[1] @ way > options.one_view.least_facing
         known_from[tuple(index[known & told].T)] += 1
         told_from += 1
@@ -218,6 +224,7 @@ def _looked_into(
     scanned: dict[tuple[int, int], VoxelMask],
     surface: tuple[Points, Points, Mask],
     ways: Float[np.ndarray, "k 3"],
+    hull: Float[np.ndarray, "h 4"],
     scan: ScannedSpace,
     grid: VoxelGrid,
 ) -> VoxelMask:
@@ -231,7 +238,6 @@ def _looked_into(
     places_mm, normals, seen = surface
     hidden = _hidden(normals, seen, scan.options)
     within_mm = scan.options.seen_spacings * scan.spacing_mm + grid.voxel_mm
-    hull = _hull_of(np.concatenate([scan.on_mm, scan.broken.place_mm]))
     mouths, looked = {}, np.zeros_like(void)
     for (axis, way), index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
         toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
@@ -256,13 +262,13 @@ def _amid(points_mm: Points, hull: Float[np.ndarray, "h 4"], beyond_mm: float) -
     return amid
 
 
-def _hull_of(points_mm: Points) -> Float[np.ndarray, "h 4"]:
-    """Planes of the faces of what holds all points: outward unit normals, and offsets.
+def _hull_of(scan: ScannedSpace) -> Float[np.ndarray, "h 4"]:
+    """Planes of the faces of what holds all scanned points: outward unit normals, and offsets.
 
     A hull of none, if they lie in a plane.
     """
     try:
-        return np.asarray(ConvexHull(points_mm).equations)
+        return np.asarray(ConvexHull(np.concatenate([scan.on_mm, scan.broken.place_mm])).equations)
     except QhullError:
         return np.array([[0.0, 0.0, 0.0, np.inf]])
 

@@ -126,9 +126,8 @@ def ways_past(
     """
     broken_mm, options = scan.broken.place_mm, scan.options.one_view
     some_mm = broken_mm[:: len(broken_mm) // options.places + 1]
-    share = np.array(
-        [_toward(way, void, np.zeros_like(void), grid, some_mm)[0].mean() for way in ways]
-    )
+    no_wall = np.zeros_like(void)
+    share = np.array([_toward(way, void, no_wall, grid, some_mm)[0].mean() for way in ways])
     if share.max() < options.least_past:
         return np.zeros((0, 3))
     return ways[share >= options.as_good * share.max()]
