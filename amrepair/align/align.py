@@ -186,7 +186,7 @@ def _from_anywhere(
         if found.left_out_ratio > 0.0:  # what was left out may be half of the other hand
             whole = ratio * (1.0 - found.left_out_ratio)
             _refuse_mirrored(scan, template, found, scan.points_mm, whole, options, rng)
-    sizes = other_size(scan, template, options.told_size_jump)
+    sizes = other_size(scan, template, options)
     in_surroundings = found.left_out_ratio > options.much_left_out and not part_is_known
     if in_surroundings:
         sizes = f" ({found.left_out_ratio:.0%} of the scan are taken for its surroundings){sizes}"

@@ -16,13 +16,34 @@ SIZE_POINTS = 20_000
 WRONG_SCALE = 200.0
 
 
-def other_size(scan: Scan, template: Template, told_jump: float) -> str:
-    """What to add to a refusal, where the sizes differ much."""
+def other_size(scan: Scan, template: Template, options: AlignOptions) -> str:
+    """What to add to a refusal, where the sizes differ much: also which unit would explain it."""
     size = diagonal(scan.points_mm)
     other = diagonal(template.bounds_mm)
-    if 1.0 / told_jump < size / max(other, 1e-12) < told_jump:
+    ratio = size / max(other, 1e-12)
+    if 1.0 / options.told_size_jump < ratio < options.told_size_jump:
         return ""
-    return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm)"
+    question, advice = _other_unit(ratio, options)
+    question = f": {question}" if question else ""
+    return f" (the scan is {size:.3g} mm across, its template {other:.3g} mm{question}){advice}"
+
+
+def _other_unit(ratio: float, options: AlignOptions) -> tuple[str, str]:
+    """Ask which unit explains two sizes, and say how the scan's is told; empty if none does."""
+    slack = options.unit_slack
+    as_large = {unit: ratio * MM_PER[unit] for unit in SCAN_UNITS}
+    units = [unit for unit in SCAN_UNITS if 1 / slack < as_large[unit] < slack]
+    if not units and ratio < 1.0:  # with what surrounds the part a scan is larger
+        units = [unit for unit in SCAN_UNITS if slack <= as_large[unit] <= options.largest_ratio]
+    near = [SCAN_UNITS[unit] for unit in units]
+    near += [  # no drawing is in micrometres
+        f"a template in {name}"
+        for unit, name in SCAN_UNITS.items()
+        if MM_PER[unit] > 1.0 and 1 / slack < ratio / MM_PER[unit] < slack
+    ]
+    question = f"{' or '.join(near)} for millimetres?" if near else ""
+    advice = f"; the scan's is said with --scan-unit {' or '.join(units)}" if units else ""
+    return question, advice
 
 
 def refuse_other_size(scan: Scan, template: Template, options: AlignOptions) -> None:
@@ -35,26 +56,15 @@ def refuse_other_size(scan: Scan, template: Template, options: AlignOptions) -> 
     """
     size = diagonal(scan.points_mm)
     other = diagonal(template.bounds_mm)
-    ratio, slack = size / max(other, 1e-12), options.unit_slack
+    ratio = size / max(other, 1e-12)
     if options.smallest_ratio <= ratio <= options.largest_ratio:
         return
-    as_large = {unit: ratio * MM_PER[unit] for unit in SCAN_UNITS}
-    units = [unit for unit in SCAN_UNITS if 1 / slack < as_large[unit] < slack]
-    if not units and ratio < 1.0:  # with what surrounds the part a scan is larger
-        units = [unit for unit in SCAN_UNITS if slack <= as_large[unit] <= options.largest_ratio]
-    near = [SCAN_UNITS[unit] for unit in units]
-    near += [  # no drawing is in micrometres
-        f"a template in {name}"
-        for unit, name in SCAN_UNITS.items()
-        if MM_PER[unit] > 1.0 and 1 / slack < ratio / MM_PER[unit] < slack
-    ]
-    hint = f" ({' or '.join(near)} for millimetres?)" if near else ""
-    if units:
-        hint += f"; the scan's is said with --scan-unit {' or '.join(units)}"
+    question, advice = _other_unit(ratio, options)
+    hint = f" ({question}){advice}" if question else ""
     raise AlignmentError(
         f"the scan {scan.source} is {size:.3g} mm across, its template {other:.3g} mm: they cannot "
         f"be the same part in the same unit{hint}"
-        + ("" if near or ratio > 1.0 else ", or it shows too little of it")
+        + ("" if question or ratio > 1.0 else ", or it shows too little of it")
     )
 
 

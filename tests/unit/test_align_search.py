@@ -183,7 +183,8 @@ def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("amrepair.align.anywhere.by_features", lambda *_: iter(()))
     template = notched()
     points = 10.0 * sample_surface(template.body, 3.0, seed=4)[0]  # centimetres taken for mm
-    with pytest.raises(AlignmentError, match=r"mm across, its template 47\.3 mm"):
+    asks = r"mm across, its template 47\.3 mm: a template in centimetres for millimetres\?\)"
+    with pytest.raises(AlignmentError, match=asks):
         aligned(template, points, options=QUICK_ALONE)
 
 
