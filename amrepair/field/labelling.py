@@ -279,15 +279,7 @@ def _told(scan: ScannedSpace, grid: VoxelGrid) -> Float[np.ndarray, " v"]:
     deep_mm = scan.options.deep_extents * float(np.ptp(scan.template.bounds_mm, axis=0).max())
     facet = (grid.voxel_mm / scan.spacing_mm) ** 2
     told = np.where(inside, 1.0, -1.0) * grid.voxel_mm / deep_mm
-    on_mm = scan.on_mm[~has_near(scan.on_mm, scan.broken.place_mm, grid.voxel_mm)]
-    f_mm, gradient = scan.template.distance_and_gradient(on_mm)
-    outward = unit_vectors(gradient)
-    for way in (-0.5, 0.5):
-        number = grid.numbers_at(on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward)
-        number = number[number >= 0]
-        number = number[inside[number] == (way < 0)]
-        count = np.bincount(number, minlength=len(told))
-        told += np.sign(way) * count * np.log(scan.options.stray)
+    told -= np.log(scan.options.stray) * points_beside(scan, grid)
     for axis in range(3):
         for end in (0, -1):
             face = np.take(grid.number, end, axis=axis)
@@ -297,3 +289,21 @@ def _told(scan: ScannedSpace, grid: VoxelGrid) -> Float[np.ndarray, " v"]:
             same = beyond == inside[face]  # else the template's surface lies between
             told[face[same]] += np.where(beyond[same], facet, -facet)
     return told
+
+
+def points_beside(scan: ScannedSpace, grid: VoxelGrid) -> Float[np.ndarray, " v"]:
+    """(v,) how many points of the template's surface lie at each voxel: negative of those outside.
+
+    Points within a voxel of broken surface do not count.
+    """
+    inside = grid.is_inside
+    beside = np.zeros(len(inside))
+    on_mm = scan.on_mm[~has_near(scan.on_mm, scan.broken.place_mm, grid.voxel_mm)]
+    f_mm, gradient = scan.template.distance_and_gradient(on_mm)
+    outward = unit_vectors(gradient)
+    for way in (-0.5, 0.5):
+        number = grid.numbers_at(on_mm + (way * grid.voxel_mm - f_mm)[:, None] * outward)
+        number = number[number >= 0]
+        number = number[inside[number] == (way < 0)]
+        beside -= np.sign(way) * np.bincount(number, minlength=len(beside))
+    return beside

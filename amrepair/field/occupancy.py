@@ -23,6 +23,7 @@ from amrepair.field.labelling import (
     Labelling,
     WatchedSurface,
     cover_of,
+    points_beside,
     unexplained,
 )
 from amrepair.field.minimum_cut import facets_of
@@ -79,6 +80,7 @@ def find_occupancy(
     sought = Labelling(scan, grid, facets, watched, unexplained(scan, facets, grid.voxel_mm))
     solid = grid.labelled(sought.empty()).solid
     found = _as_seen(solid, scan, grid)
+    found &= ~_held_by_strays(found, scan, grid)
     found |= _guessed(found, (*surface, seen), replace(scan, on_mm=on_mm), grid)
     return Occupancy(grid.low_mm, grid.voxel_mm, found, grid.f_mm < 0)
 
@@ -128,6 +130,25 @@ def _as_seen(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask
         alone = differs & ~((broken_mm2 > 0) & (broken_mm2 >= least_mm2))[groups]
         found[alone] = designed[alone]
     return found
+
+
+def _held_by_strays(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask:
+    """Lumps in the template that hang together with nothing else, and are no larger than a stray.
+
+    Where a part is gone some points stray to where its surface was. Each holds a voxel, but makes
+    no surface: on that half as many points as expected lie at least.
+    """
+    beside = np.zeros(solid.shape)
+    beside[grid.number >= 0] = points_beside(scan, grid)
+    few = 0.5 * (grid.voxel_mm / scan.spacing_mm) ** 2
+    every = np.ones((3, 3, 3), bool)
+    stray = ndimage.binary_dilation((beside > 0) & (beside < few), every)
+    lump, count = ndimage.label((grid.f_mm < 0) & solid, every)
+    larger = np.zeros(count + 1, bool)
+    larger[lump[~stray]] = True
+    for axis in range(3):  # beyond the box it may go on
+        larger[np.take(lump, (0, -1), axis=axis)] = True
+    return ~larger[lump] & (lump > 0)
 
 
 def _guessed(
