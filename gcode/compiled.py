@@ -61,7 +61,6 @@ from numba.core import bytecode, event
 from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.cpu import CPUContext
-from numba.core.cpu_options import ParallelOptions
 from numba.core.environment import lookup_environment
 from numba.core.runtime import nrt, nrtdynmod
 from numba.core.targetconfig import TargetConfig
@@ -84,14 +83,6 @@ OWN_OPTIONS: dict[str, Any] = {
     "error_model": "python",
     "no_cfunc_wrapper": True,
 }
-# Loops are shared out where `prange` says so. To share out what fills an array with zeros, too,
-# takes numba half a second more for each such line, and saves none.
-ONLY_LOOPS = cast(Any, ParallelOptions)(
-    dict.fromkeys(
-        ("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil"),
-        False,
-    )
-)
 # The slowest kernel takes six seconds alone, with all that it calls eleven.
 LONGEST_COMPILE_S = 60.0
 COMPILE_POLL_S = 0.02
@@ -354,8 +345,6 @@ def njit(*, inner: bool = False, **options: Any) -> Callable[[Callable[..., Any]
         Whether other kernels alone call it.
     """
     options = OWN_OPTIONS | {"no_cpython_wrapper": inner} | options
-    if options.get("parallel"):
-        options["parallel"] = ONLY_LOOPS
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
