@@ -23,6 +23,7 @@ from gcode.slicing.patch import NOT_CLOSED, LeftCause, PatchPlan, slice_patch
 from gcode.slicing.patch_free import ASIDE_MM
 from gcode.surfaces import HeightField
 from gcode.writer import write
+from tests.draws import draws
 
 SETUP = load_setup()
 TOP_MM = 4.0
@@ -520,7 +521,7 @@ def test_beads_grow_a_line_s_width_a_layer_out_over_what_is_out_of_reach() -> No
     assert (np.diff(wide) < 2 * 0.7 + ASIDE_MM).all()
 
 
-@pytest.mark.parametrize("higher_mm", [0.05, 0.1, 0.15])
+@pytest.mark.parametrize("higher_mm", draws([0.05, 0.1, 0.15], 0.1))
 def test_where_the_layers_lie_hardly_decides_how_much_of_a_pit_is_filled(higher_mm: float) -> None:
     """Beads over a hollow began at the layer after the one at which the head got in."""
     shares = []

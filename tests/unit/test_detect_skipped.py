@@ -24,6 +24,7 @@ from amrepair.scans import Scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
 from tests import analytic
+from tests.draws import draws
 
 SIGMA_MM = 0.03
 TOP_MM, WIDE_MM, HIGH_MM = 6.0, 0.42, 0.2
@@ -496,7 +497,9 @@ def strands(apart_mm: float, thick_mm: float, gone: range) -> tuple[m3.Manifold,
 
 
 @pytest.mark.parametrize("gone", [range(0), range(4, 5)])
-@pytest.mark.parametrize(("apart_mm", "thick_mm"), [(0.42, 0.25), (0.48, 0.28), (0.55, 0.3)])
+@pytest.mark.parametrize(
+    ("apart_mm", "thick_mm"), draws([(0.42, 0.25), (0.48, 0.28), (0.55, 0.3)], (0.48, 0.28))
+)
 def test_strands_over_a_shallow_pocket_are_there_though_its_floor_is_seen_between_them(
     apart_mm: float, thick_mm: float, gone: range
 ) -> None:

@@ -37,6 +37,7 @@ from gcode.reader import Beads, Job, job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 from tests import analytic
+from tests.draws import draws
 
 SETUP = load_setup(process="repair_0.20")
 LAYER_MM = 0.2
@@ -367,7 +368,7 @@ def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
     assert (final.planned is not None) == (moved_mm != 0.0)
 
 
-@pytest.mark.parametrize("moved_mm", [0.0, -0.1])
+@pytest.mark.parametrize("moved_mm", draws([0.0, -0.1], 0.0))
 def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) -> None:
     """regression: a dome's were told moved by 0.1 mm, and its flanks not looked at in the end."""
     foot = m3.CrossSection.circle(9.0, 48)
