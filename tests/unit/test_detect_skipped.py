@@ -337,7 +337,7 @@ def test_of_a_scanner_that_errs_lines_are_told_over_longer_stretches(seed: int) 
     assert elsewhere_mm == 0.0
 
 
-@pytest.mark.parametrize("over_mm", [5.0, np.inf])
+@pytest.mark.parametrize("over_mm", draws([5.0, np.inf], 5.0))
 def test_where_errors_reach_as_far_over_their_length_no_line_is_told(over_mm: float) -> None:
     sigma_mm, length_mm = (0.13, 2.0) if np.isinf(over_mm) else (0.8, 8.0)
     lacks = erring(BLOCK.body - TWO_LINES, 1, sigma_mm, length_mm)

@@ -165,7 +165,7 @@ def test_what_broke_off_one_side_is_no_shift(box: tuple[Job, int], deep_mm: floa
     assert layer_shift(cloud, NO_WALLS, NOISE_MM, job, line) is None
 
 
-@pytest.mark.parametrize("sides", [1, 4])
+@pytest.mark.parametrize("sides", draws([1, 4], 1))
 def test_walls_tell_where_tops_are_as_they_should_be(box: tuple[Job, int], sides: int) -> None:
     # many layers later nothing but walls shows where the lower ones lie
     job, line = box

@@ -256,7 +256,7 @@ def test_a_dent_beside_a_bump_that_nobody_saw_does_not_take_it_along() -> None:
     assert deficit.missing_mm3 == pytest.approx((part ^ cut).volume(), rel=0.1)
 
 
-@pytest.mark.parametrize("seen_mm", [20.0, 26.0])
+@pytest.mark.parametrize("seen_mm", draws([20.0, 26.0], 20.0))
 def test_a_notch_at_the_end_of_the_view_does_not_take_the_rest_along(seen_mm: float) -> None:
     # regression: where the view ended within a notch, all that it had not seen was told missing,
     # 27 times what was; of the head's way past it, too, nothing stood there
@@ -272,7 +272,9 @@ def test_a_notch_at_the_end_of_the_view_does_not_take_the_rest_along(seen_mm: fl
 
 
 @pytest.mark.parametrize(
-    ("size", "at"), [((9, 9, 12), (33, 17, -1)), ((8, 8, 12), (16, 8, -1))], ids=["corner", "hole"]
+    ("size", "at"),
+    draws([((9, 9, 12), (33, 17, -1)), ((8, 8, 12), (16, 8, -1))], ((8, 8, 12), (16, 8, -1))),
+    ids=["corner", "hole"],
 )
 def test_what_is_gone_down_to_an_unseen_underside_is_measured(
     size: tuple[float, float, float], at: tuple[float, float, float]
