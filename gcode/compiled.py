@@ -23,6 +23,11 @@ machine, and in its own on another.
 A kernel is compiled for types of arguments, not for values: numba compiles a kernel that another
 calls with `True` or `1` in its text once more for that very value, and no kernel asks for it.
 
+A kernel that kernels alone call (`inner=True`) gets no way in from Python, and none gets one from
+C: for each of them numba compiles another function, which takes apart every argument. And what has
+no way in is neither optimised nor turned into machine code by itself: the kernel that calls it has
+it in its own code, where both is done again.
+
 Threads are OpenMP's, and sleep while they wait. Where numba finds a TBB it takes that first, whose
 threads spin: beside one other busy process an alignment took six times as long, and a process that
 was done did not end for minutes.
@@ -30,14 +35,16 @@ was done did not end for minutes.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import importlib
+import inspect
 import itertools
 import os
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -51,10 +58,17 @@ import numpy as np
 from llvmlite.binding import ffi
 from numba import get_num_threads, prange, set_num_threads, types
 from numba.core import bytecode, event
+from numba.core.base import BaseContext
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
+from numba.core.cpu import CPUContext
+from numba.core.environment import lookup_environment
 from numba.core.runtime import nrt, nrtdynmod
 from numba.core.targetconfig import TargetConfig
+from numba.core.typed_passes import BaseNativeLowering
 from numba.extending import overload
 from numba.np import arrayobj
+from numba.np.ufunc import parallel
+from numba.parfors import parfor_lowering
 
 from gcode.locks import try_lock
 
@@ -62,13 +76,20 @@ __all__ = ["all_from_disk", "get_num_threads", "njit", "prange", "read_only", "s
 
 _KERNEL_PACKAGES = ("gcode", "amrepair")
 _PROCESS_TOKEN = secrets.token_hex(4)
-# What numba leaves to the kernel that calls, where a kernel does not say it itself.
-OWN_OPTIONS: dict[str, Any] = {"fastmath": False, "error_model": "python"}
+# What numba leaves to the kernel that calls, where a kernel does not say it itself; and no way in
+# from C.
+OWN_OPTIONS: dict[str, Any] = {
+    "fastmath": False,
+    "error_model": "python",
+    "no_cfunc_wrapper": True,
+}
 # The slowest kernel takes six seconds alone, with all that it calls eleven.
 LONGEST_COMPILE_S = 60.0
 COMPILE_POLL_S = 0.02
 # What a process makes while it compiles all kernels is some ten thousand functions.
 _PLACE_BITS, _COUNT_BITS = 40, 20
+_LINKED_ONLY = "linked only"
+_CONSTANTS_PREFIX = "_ZN08NumbaEnv"  # as numba names where a function's constants are
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
@@ -109,7 +130,8 @@ def runtime_when_asked() -> None:
     def library(runtime: Any) -> Any:
         found = asked(runtime)
         if isinstance(found, functools.partial):
-            found = runtime._library = found()
+            with _linked_only(False):
+                found = runtime._library = found()
         return found
 
     nrtdynmod.compile_nrt_functions = functools.partial(functools.partial, compile_now)
@@ -157,6 +179,111 @@ def lock_untold() -> None:
         lock._cblist.clear()
 
 
+def loops_without_ways_in() -> None:
+    """Compile the body of a `prange` with no way in from Python: its threads call it directly."""
+    body: Any = getattr(parfor_lowering, "_create_gufunc_for_parfor_body", None)
+    if "flags" not in getattr(getattr(body, "__code__", None), "co_varnames", ()):
+        return  # a numba that does it otherwise
+    asked = inspect.signature(body)
+
+    def without(*values: Any, **named: Any) -> Any:
+        given = asked.bind(*values, **named).arguments
+        given["flags"].no_cpython_wrapper = True
+        return body(**given)
+
+    cast(Any, parfor_lowering)._create_gufunc_for_parfor_body = without
+
+
+class _Library(cast(Any, JITCodeLibrary)):  # type: ignore[misc]
+    """Code of one function with all that it calls; or, of what is only called, the code to link."""
+
+    compiles_only_callers = False  # set while what is made has no way in of its own
+
+    def __init__(self, *values: Any, **named: Any) -> None:
+        super().__init__(*values, **named)
+        self._is_linked_only = _Library.compiles_only_callers
+
+    def _optimize_final_module(self) -> None:
+        if not self._is_linked_only:
+            super()._optimize_final_module()
+
+    def _finalize_final_module(self) -> None:
+        if self._is_linked_only:
+            self._finalized = True
+        else:
+            super()._finalize_final_module()
+
+    def serialize_using_object_code(self) -> Any:
+        """What is kept on disk; the kind says of what there is no machine code."""
+        if not self._is_linked_only:
+            return super().serialize_using_object_code()
+        name, _, code = self.serialize_using_bitcode()
+        return name, _LINKED_ONLY, code
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+        name, kind, code = state
+        if kind != _LINKED_ONLY:
+            return super()._unserialize(codegen, state)
+        with _linked_only(True):
+            return super()._unserialize(codegen, (name, "bitcode", code))
+
+
+@contextlib.contextmanager
+def _linked_only(choice: bool) -> Iterator[None]:
+    """Libraries that are made meanwhile are linked only, or not; numba's lock is held."""
+    before, _Library.compiles_only_callers = _Library.compiles_only_callers, choice
+    try:
+        yield
+    finally:
+        _Library.compiles_only_callers = before
+
+
+def machine_code_at_the_end() -> None:
+    """Have numba optimise and compile what is called from Python, with all that it calls, once.
+
+    By itself it does both with each function that a kernel calls, and then with the kernel and all
+    of them in it again; with a `prange` four times. Where code is linked alone, the places that
+    refer to a function's constants are there only with the kernel's own code, and are set then.
+    """
+    kinds: tuple[Any, ...] = (BaseContext, BaseNativeLowering, CPUContext, parallel, JITCPUCodegen)
+    base, native, context, loops, codegen = kinds
+    own, lower = base._compile_subroutine_no_cache, native.run_pass
+    executable, set_env = context.get_executable, codegen.set_env
+    wrapped, constants_of = loops.build_gufunc_wrapper, cast(Any, lookup_environment)
+
+    def run_pass(self: Any, state: Any) -> Any:
+        with _linked_only(bool(state.flags.no_cpython_wrapper)):
+            return lower(self, state)
+
+    def _compile_subroutine_no_cache(*values: Any, **named: Any) -> Any:
+        with _linked_only(True):
+            return own(*values, **named)
+
+    def build_gufunc_wrapper(*values: Any, **named: Any) -> Any:
+        with _linked_only(bool(named.get("is_parfors"))):
+            return wrapped(*values, **named)
+
+    def get_executable(self: Any, library: Any, fndesc: Any, env: Any) -> Any:
+        found = executable(self, library, fndesc, env)
+        if not getattr(library, "_is_linked_only", True):
+            for variable in library._final_module.global_variables:
+                if variable.name.startswith(_CONSTANTS_PREFIX):
+                    constants = constants_of(variable.name)
+                    if constants is not None:
+                        library.codegen.set_env(variable.name, constants)
+        return found
+
+    def set_env_if_there(self: Any, env_name: str, env: Any) -> None:
+        if self._engine.get_global_value_address(env_name):
+            set_env(self, env_name, env)
+
+    base._compile_subroutine_no_cache = _compile_subroutine_no_cache
+    native.run_pass, context.get_executable = run_pass, get_executable
+    loops.build_gufunc_wrapper = build_gufunc_wrapper
+    codegen.set_env, codegen._library_class = set_env_if_there, _Library
+
+
 class _WithoutCollector(event.Listener):
     """Holds Python's collector of circles while a kernel is compiled.
 
@@ -200,6 +327,8 @@ cast(Any, event).register("numba:compile", _without_collector)
 shapes_unsaid()
 options_at_once()
 lock_untold()
+loops_without_ways_in()
+machine_code_at_the_end()
 
 
 def all_from_disk() -> bool:
@@ -207,13 +336,21 @@ def all_from_disk() -> bool:
     return _without_collector.times == 0
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit`, once for each type of arguments, and kept safely where it is kept."""
-    options = OWN_OPTIONS | options
+def njit(*, inner: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit`, once for each type of arguments, and kept safely where it is kept.
+
+    Parameters
+    ----------
+    inner
+        Whether other kernels alone call it.
+    """
+    options = OWN_OPTIONS | {"no_cpython_wrapper": inner} | options
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
         compile_for_types(dispatcher)
+        if inner:
+            keep_inside(dispatcher)
         kept = getattr(dispatcher._cache, "_cache_file", None)
         if kept is not None:
             keep_safely(kept)
@@ -243,6 +380,18 @@ def compile_for_types(dispatcher: Any) -> None:
         return asked(tuple(unliteral(kind) for kind in args), named)
 
     dispatcher.get_call_template = template
+
+
+def keep_inside(dispatcher: Any) -> None:
+    """Refuse calls from Python, which would jump to where nothing is."""
+
+    def add(compiled: Any) -> None:
+        dispatcher.overloads[tuple(compiled.signature.args)] = compiled
+
+    def refuse(*values: Any, **named: Any) -> Any:
+        raise TypeError(f"kernels alone call {dispatcher.__name__}; see `inner` in gcode.compiled")
+
+    dispatcher.add_overload, dispatcher._compile_for_args = add, refuse
 
 
 def keep_safely(kept: Any) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from gcode.compiled import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _slot_of(x: Any, y: Any, z: Any, slots: Any) -> Any:
     """Where a place of whole numbers belongs in a table of 2ⁿ slots."""
     # odd numbers without pattern: products spread over all bits of a key
@@ -79,7 +79,7 @@ def put_in_table(vertices: Any, count: int, table: Any, per_mm: float) -> None:
         table[slot] = i
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _first_of(faces: Any, a: int, b: int, first: Any, after: Any, take: bool) -> int:
     """The first half-edge in its chain that runs from a to b; -1 where there is none left."""
     slot = _slot_of(a, b, 0, first.shape[0])

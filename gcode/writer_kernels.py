@@ -11,7 +11,7 @@ from gcode.compiled import njit
 LONGEST_LINE = 96  # three axes and E, each of at most nineteen digits
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def put_number(out: Any, at: int, value: int, digits: int) -> int:
     """Write a number of so many decimal places, without trailing zeros; returns where it ends."""
     if value < 0:

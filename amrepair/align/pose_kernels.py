@@ -8,7 +8,7 @@ import numpy as np
 from gcode.compiled import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def solve(h, b):
     """Solve a symmetric positive system of six by Cholesky, in place."""
     for i in range(6):
@@ -30,7 +30,7 @@ def solve(h, b):
         b[i] /= h[i, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def turn(r, x, y, z):
     """Turn a rotation further by an axis-angle vector, in place (Rodrigues)."""
     angle = np.sqrt(x * x + y * y + z * z)
@@ -46,7 +46,7 @@ def turn(r, x, y, z):
         r[2, column] = d + s * cd + c * (x * cb - y * ca)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def step_down(r, p, h, b, damping, least, widest, reach):
     """One damped Gauss–Newton step of a pose, in place; `h` and `b` are used up.
 

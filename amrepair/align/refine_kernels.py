@@ -144,7 +144,7 @@ def step(hessian, slope, known, first, rotation, place, last, pace, scale, itera
     return GO_ON, pace, scale
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _asked(local, rotation, place, grid, turned, f, gradient):
     """The points turned, the grid's field at their places, and its gradient there."""
     origin, cell, base, block_of, blocks = grid
@@ -160,7 +160,7 @@ def _asked(local, rotation, place, grid, turned, f, gradient):
         )
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _to_its_end(
     local, rotation, place, known, scale, most, limits, outside, grid, hessian, residual
 ):

@@ -23,7 +23,7 @@ SHORTEST = np.float32(1e-9)  # nothing is divided by less
 # nodes are computed as floats, which are exact below 2²⁴.
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _trimmed(along, trim, ends):
     """The lowest and the highest but `trim` at each end, without sorting all of them."""
     ends[0], ends[1] = np.inf, -np.inf
@@ -225,10 +225,12 @@ def descend(points, rotations, places, values, shape, scales, cap):
     for k in prange(len(rotations)):
         r, p = rotations[k], places[k]
         h, b = np.empty((6, 6)), np.empty(6)
-        for step in range(len(scales)):
-            _accumulate(points, r, p, values, shape, scales[step], cap, h, b)
-            step_down(r, p, h, b, SEARCH_DAMPING, 1e-12, WIDEST_SEARCH_RAD, reach)
-        total = _accumulate(points, r, p, values, shape, scales[-1], cap, h, b)
+        total = np.float32(0.0)
+        for step in range(len(scales) + 1):  # it is inlined once: at the end, the sum counts alone
+            scale = scales[min(step, len(scales) - 1)]
+            total = _accumulate(points, r, p, values, shape, scale, cap, h, b)
+            if step < len(scales):
+                step_down(r, p, h, b, SEARCH_DAMPING, 1e-12, WIDEST_SEARCH_RAD, reach)
         scores[k] = total / points.shape[1]
     return scores
 

@@ -45,7 +45,7 @@ def first_of_voxels(points, low, voxel, most, slots, chosen):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _spread_bits(v):
     """The 21 low bits of a number, two zeros after each."""
     v = (v | (v << 32)) & 0x1F00000000FFFF

@@ -31,7 +31,7 @@ class PointsByCell(NamedTuple):
     points: Any
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def plane_of(x, y, iy, ix, high, low, cloud, reach, radius):
     """(7,) of the points within a radius and two heights: mean, normal and spread along it.
 
@@ -68,7 +68,7 @@ def plane_of(x, y, iy, ix, high, low, cloud, reach, radius):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def ends_around(z, gone, i, j):
     """Highest and lowest of what stands around a column, and of that the lowest in what is gone."""
     ny, nx = z.shape
@@ -82,7 +82,7 @@ def ends_around(z, gone, i, j):
     return high, low, max(foot, low)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def way_down(z, gone, i, j, middle, into_gone):
     """(2,) from what is higher than `middle` around a column to what is lower, columns and rows.
 

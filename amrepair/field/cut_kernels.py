@@ -51,7 +51,7 @@ def _room(t, mine, i, j, way):
     return t.fits[i, way] if mine == SOLID else t.fits[j, way ^ 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _grown(t, i, queue, waits, last):
     """Take in what a voxel reaches; the way to where the other tree is met, −1 if nowhere."""
     mine = t.tree[i]
@@ -81,7 +81,7 @@ def _put(i, queue, waits, last):
     return last
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _least(t, i, least):
     """How much flow fits between a voxel and its root, at most so much; and the root."""
     mine = t.tree[i]
@@ -101,7 +101,7 @@ def _cut_off(t, i, lost, count):
     return count + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _pushed(t, i, amount, lost, count):
     """Flow pushed between a voxel and its root; what has no parent any more is lost."""
     mine = t.tree[i]
@@ -118,7 +118,7 @@ def _pushed(t, i, amount, lost, count):
     return _cut_off(t, i, lost, count) if t.ends[i] == 0 else count
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _steps_to_root(t, i, now):
     """Of a voxel of a tree; marked on the way, so that no way is gone twice."""
     steps, k = 0, i
@@ -140,7 +140,7 @@ def _steps_to_root(t, i, now):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _adopted(t, lost, count, now, queue, waits, last):
     """A new parent for each that lost its own, or it is free, and those that it held are lost."""
     while count > 0:

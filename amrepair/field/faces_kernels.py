@@ -12,7 +12,7 @@ from gcode.compiled import njit, prange
 ONE_SURFACE = 0.8
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def plane_through(points, index, weight, mean, normal):
     """Mean of some points by weight, and normal of the plane through them, into the last two."""
     total = 0.0

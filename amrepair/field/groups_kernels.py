@@ -8,7 +8,7 @@ import numpy as np
 from gcode.compiled import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _first(linked, i):
     """The first of those that one is linked with so far; ways to it are halved."""
     while linked[i] != i:

@@ -81,7 +81,7 @@ def _put_in(near, near2, k, p, here2):
     near[j], near2[j] = p, here2
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _closer(x, y, z, near, near2, k, tree, stack, stack2):
     """Make the k nearest of all places of k places and their squared distances, both in order."""
     ordered, box, child, first, last = tree

@@ -25,7 +25,7 @@ TREND_TERMS = 4
 RIDGE, TINY = 1e-3, 1e-9
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def median(values, n):
     """The median of the first n values, which are put in order: few, so by insertion."""
     for k in range(1, n):
@@ -38,7 +38,7 @@ def median(values, n):
     return values[half] if n % 2 else 0.5 * (values[half - 1] + values[half])
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _alike(normal, value, i, j, cosine, aside):
     """Whether two cells face the same way, or both are more than `aside` off on the same side.
 
@@ -83,7 +83,7 @@ def neighbours(keys, stride_x, stride_y, normal, value, cosine, aside):
     return table, count
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _off_plane(place, value, table, n, i, off):
     """Distances of a window's values from the plane through them by least squares, into `off`."""
     first, second = np.zeros(TREND_TERMS), np.zeros((TREND_TERMS, TREND_TERMS))

@@ -15,7 +15,7 @@ _NORMAL = np.exp(
 ).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _height(raster, x, y, cell):
     """Of the column over a place, and of the nearest one where the raster ends."""
     i = min(max(int(np.floor(y / cell)), 0), raster.shape[0] - 1)
@@ -23,7 +23,7 @@ def _height(raster, x, y, cell):
     return raster[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _normal(off, per_mm):
     """Of a height so far off, as a share of the density where it is off by nothing."""
     entry = int(abs(off) * per_mm)

@@ -184,7 +184,7 @@ def open_side(looks, facing, directions, places, planes, grid, discs, sheet):
     return votes
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _has(scan, q, places, normals, index, low, cell, near, facing):
     """Whether a scan has surface itself where a surfel of another lies."""
     ix = int(np.floor((places[q, 0] - low[0]) / cell))
@@ -259,7 +259,7 @@ def columns(places, normals, scan, index, low, cell, near, far, facing):
     return support, conflict, apart
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _gathered(place, points, normals, grid, radius, near, weight, height):
     """Points within a radius of a place: how many; their numbers, weights and signed heights."""
     ix = int(np.floor((place[0] - grid.low[0]) / grid.cell))
@@ -282,7 +282,7 @@ def _gathered(place, points, normals, grid, radius, near, weight, height):
     return m
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _each_alone(scan, weight, height, sigma, value, noise):
     """Mean height of each scan and its standard deviation, in place; NaN of fewer than 3 points.
 
@@ -306,7 +306,7 @@ def _each_alone(scan, weight, height, sigma, value, noise):
         noise[s] = np.sqrt(noise[s]) / total[s] if number[s] >= 3 else np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _overruled(value, noise, rules, banned):
     """Scans that differ from the median of all, in `banned`; how many were heard; the variance.
 
@@ -341,7 +341,7 @@ def _overruled(value, noise, rules, banned):
     return who, variance / (kept - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _together(near, weight, height, normals, radius, rounds):
     """Robust implicit moving least squares, which keep edges (Öztireli 2009)."""
     f = gx = gy = gz = 0.0
@@ -364,7 +364,7 @@ def _together(near, weight, height, normals, radius, rounds):
     return f
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _at_node(place, points, normals, scan, scans, grid, rules):
     """Of one node, what `fused_nodes` returns."""
     near, weight, height = np.empty(MAX_NEAR, np.int64), np.empty(MAX_NEAR), np.empty(MAX_NEAR)

@@ -24,7 +24,7 @@ class Camera(NamedTuple):
     sheet: int
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(inner=True, cache=True, nogil=True, error_model="numpy")
 def _pixel(point, camera):
     """Of a place: its pixel, how deep it lies along the middle ray, and its own ray.
 

@@ -11,7 +11,7 @@ EDGE, FLYING = 1, 2
 OUTSIDE, GAP, SMOOTH, NEARER, FARTHER = 0, 1, 2, 3, 4
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _state(index, depth, spacing, row, column, i, lateral, steepest):
     """How the pixel at (row, column) goes on from point i, `lateral` spacings away."""
     if row < 0 or column < 0 or row >= index.shape[0] or column >= index.shape[1]:
@@ -102,7 +102,7 @@ def lists_of_numbers(numbers, count):
     return out, at
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _number(data, at, size, big):
     value = np.int64(0)
     for k in range(size):

@@ -19,7 +19,7 @@ TOUCH_MM = 1e-9  # intervals this close are one: far below any layer, far above 
 FRESH, FREE_ENTRY = 0, 1  # entries of `meta`
 
 
-@njit(cache=True, nogil=True, inline="never")
+@njit(inner=True, cache=True, nogil=True, inline="never")
 def allocate(pool, pool_next, meta, lo, hi, following):
     """Take a pool node for (lo, hi); the caller has made sure that there is room."""
     node = meta[FREE_ENTRY]
@@ -34,7 +34,7 @@ def allocate(pool, pool_next, meta, lo, hi, following):
     return node
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def release(pool_next, meta, node):
     """Give a pool node back; returns what followed it."""
     following = pool_next[node]
@@ -54,7 +54,7 @@ class Stacks(NamedTuple):
     meta: Any
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z):
     """Highest solid at or below z (0: the bed); z itself where z lies inside solid."""
     top = hi[iy, ix]
@@ -72,7 +72,7 @@ def surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z):
     return 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     """Unite the column with [a, b]; needs room for one pool node."""
     if hi[iy, ix] <= lo[iy, ix]:
@@ -111,7 +111,7 @@ def insert(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     nxt[iy, ix] = node
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def cut(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     """Take [a, b] out of the column; needs room for one pool node; returns the length removed."""
     removed = 0.0
@@ -167,7 +167,7 @@ def cut(hi, lo, nxt, pool, pool_next, meta, iy, ix, a, b):
     return removed
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def grown(pool, pool_next, meta, room):
     """The same pool with room for at least `room` more nodes."""
     capacity = len(pool_next)

@@ -178,7 +178,7 @@ def edge_span(hi, lo, nxt, pool, pool_next, before, stamp, bead, axis, iy, ix, z
     return bottom, top
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def planed(hi, lo, near, row, count, cx, cy, z, most):
     """What the nozzle's flat takes off columns that stand above z by up to `most`, mm of column."""
     ny, nx = hi.shape
@@ -194,7 +194,7 @@ def planed(hi, lo, near, row, count, cx, cy, z, most):
     return taken
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def pressed(hi, lo, nxt, pool, pool_next, meta, near, row, count, cx, cy, z, amount, thickness):
     """Press plastic into the voids right under what was just laid; returns what finds no room."""
     ny, nx = hi.shape
@@ -223,7 +223,7 @@ def pressed(hi, lo, nxt, pool, pool_next, meta, near, row, count, cx, cy, z, amo
     return amount
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def level_of(floors, count, amount, z):
     """Level to which `amount` (mm of column) fills the first `count` floors, sorted rising."""
     used = 0.0
@@ -238,7 +238,7 @@ def level_of(floors, count, amount, z):
     return z
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def lay(world, head, bead, room, state, x, y, z, amount, flush):
     """One step: place `amount` (mm of column) from the nozzle at (x, y, z)."""
     (hi, lo, nxt, pool, pool_next, meta), before, stamp = world
@@ -391,7 +391,7 @@ def lay(world, head, bead, room, state, x, y, z, amount, flush):
     window[3] = max(window[3], cx)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def flow_factor(regions, x, y, z):
     """Product of the flow factors of all defect regions that hold (x, y, z)."""
     factor = 1.0
@@ -406,7 +406,7 @@ def flow_factor(regions, x, y, z):
     return factor
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def height_of_strand(world, head, path, state, s, k, x, y, z):
     """Height at which step k of segment s is laid, and how deep below that it fills columns.
 

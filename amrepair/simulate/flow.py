@@ -6,9 +6,9 @@ It changes motion before the world sees it; how plastic lies down is the world's
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
-from scipy.signal import lfilter
 
 from amrepair.simulate.parameters import FlowModel
 from gcode.firmware.motion import MotionBatch
@@ -40,7 +40,7 @@ def noisy_flow(
     keep = float(np.exp(-step_mm / model.over_mm))
     kicks = rng.normal(size=count) * np.sqrt(1 - keep**2)
     kicks[0] = rng.normal()
-    wander = np.asarray(lfilter([1.0], [1.0, -keep], kicks))
+    wander = np.array(list(accumulate(kicks.tolist(), lambda last, kick: kick + keep * last)))
     middle = (ends_mm - 0.5 * length_mm[laid]) / step_mm
     factor = model.mean_ratio + model.sigma_ratio * np.interp(middle, np.arange(count), wander)
     filament = motion.filament_mm.copy()

@@ -20,7 +20,7 @@ BISECTIONS = 7  # 0.8 mm / 2^7 = 0.006 mm
 BED, PART = 1, 2
 
 
-@njit(cache=True)
+@njit(inner=True, cache=True)
 def share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z):
     """Solid share of the box around a point; the bed is solid."""
     gx, gy = (x - x0) / cell, (y - y0) / cell
@@ -42,7 +42,7 @@ def share_solid(offsets, spans, ny, nx, x0, y0, cell, half_z, x, y, z):
     return total / (4 * HALF_COLUMNS * HALF_COLUMNS * 2 * half_z)
 
 
-@njit(cache=True)
+@njit(inner=True, cache=True)
 def first_hit(offsets, spans, top, z_top, x0, y0, cell, s, dx, dy, dz):
     """Parameter t of the first hit from s, by (dx, dy, dz) to the bed, and what it is."""
     ny, nx = top.shape

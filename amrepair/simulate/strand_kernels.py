@@ -77,7 +77,7 @@ def reaches(hi, before, stamp, layer, iy, ix, level):
     return hi[iy, ix] >= level
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def groove_columns(hi, before, stamp, layer, iy, ix, level, most):
     """Width, in columns, of a groove between solid that reaches `level`; 0: wider than `most`."""
     ny, nx = hi.shape
@@ -106,7 +106,7 @@ def groove_columns(hi, before, stamp, layer, iy, ix, level, most):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def found_below(hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z):
     """Highest solid at or below z that the layer being laid has found: not the strand itself."""
     if stamp[iy, ix] == layer and before[iy, ix] <= z:
@@ -114,7 +114,7 @@ def found_below(hi, lo, nxt, pool, pool_next, before, stamp, layer, iy, ix, z):
     return surface_below(hi, lo, nxt, pool, pool_next, iy, ix, z)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def is_held(world, head, layer, x, y, z, ux, uy, thickness):
     """Whether a strand at (x, y, z) that runs along (ux, uy) finds solid under or beside it."""
     (hi, lo, nxt, pool, pool_next, _), before, stamp = world
@@ -147,7 +147,7 @@ def is_held(world, head, layer, x, y, z, ux, uy, thickness):
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def run_ahead(world, head, layer, path, s, k):
     """From step k of segment s on: length to the next place that holds, and whether there is one.
 
@@ -204,7 +204,7 @@ def strand_reach(volume, length, thickness, swell):
     return max(HELD_LAYERS * thickness, swell * diameter)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def drop_of(kind, done, length, sag, droop):
     """How far a strand that is not held comes down, `done` mm after the stretch begins."""
     if kind == AT_BOTH:
@@ -216,7 +216,7 @@ def drop_of(kind, done, length, sag, droop):
     return np.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def highest_below(world, head, layer, x, y, z):
     """Highest solid under the bore that the layer has found, at or below z; 0 is the bed."""
     (hi, lo, nxt, pool, pool_next, _), before, stamp = world

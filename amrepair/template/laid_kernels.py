@@ -99,7 +99,7 @@ def at(field, corner, cell, place):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _without_room(fill, widest, corner, cell, x, y, ux, uy, flow, beside, reach):
     """Along one line inwards: most plastic without room, what of it is outside, first, widest."""
     ny, nx = fill.shape

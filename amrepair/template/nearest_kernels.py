@@ -66,7 +66,7 @@ def _box2(x, y, z, low, high, k):
     return dx * dx + dy * dy + dz * dz
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _on_triangle(px, py, pz, t):
     """Squared distance to a triangle (3, 3), and the weights of its second and third corner."""
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
@@ -101,7 +101,7 @@ def _on_triangle(px, py, pz, t):
     return dx * dx + dy * dy + dz * dz, s, w
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _above(x, y, z, t, size):
     """1 before a triangle, −1 behind it, 0 where its normal is no normal of the nearest point."""
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
@@ -170,7 +170,7 @@ def _ray_meets_box(start, one_over, low, high, k):
     return near <= far
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _ray_meets_triangle(start, way, t):
     """Whether a ray passes through a triangle (Möller and Trumbore 1997)."""
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]

@@ -42,7 +42,7 @@ def fill(start, end, width, height, origin, voxel, solid):
                         solid[ix, iy, iz] = True
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _between(x, y, z, origin, voxel, field):
     """Trilinear between voxel centres; beyond the grid the way to it is added."""
     gx, gy, gz = (
@@ -94,7 +94,7 @@ def interpolate_with_gradient(points, origin, voxel, field):
     return out, gradient
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _envelope(f, n, d, v, z):
     """Squared distances along a line: the lower envelope of parabolas that stand at its places.
 

@@ -13,7 +13,7 @@ FREE_END, TOO_LONG, BENT = 1, 2, 3
 SAME_PASS_MM = 0.015  # lower than this passes do not lie: what is laid now holds nothing beside it
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def top_of(stands, newest, iy, ix, z):
     """How high a column is for a bead at a height: what its own pass has laid does not count."""
     if newest[iy, ix] <= z - SAME_PASS_MM:
@@ -21,7 +21,7 @@ def top_of(stands, newest, iy, ix, z):
     return stands[iy, ix]
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def hold_at(stands, newest, loose, near, x, y, z, origin, cell, deep, drop):
     """What holds a bead at a place: something beside or below it, the floor alone, or nothing."""
     ny, nx = stands.shape
@@ -40,7 +40,7 @@ def hold_at(stands, newest, loose, near, x, y, z, origin, cell, deep, drop):
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def lay(stands, newest, loose, a, b, half, fell, origin, cell):
     """A bead as what stands there from the next pass on; what fell holds nothing."""
     ny, nx = stands.shape

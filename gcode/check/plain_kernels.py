@@ -18,7 +18,7 @@ MOST_DECIMALS = 22
 MOVE_WORDS = 5  # X, Y, Z, E, F
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def words_of(data, at, end, most, words):
     """Words of a line `G0 ...` or `G1 ...`: -1 if it is one, 0 if it is empty, 1 for all else.
 

@@ -64,7 +64,7 @@ def sweep(
     return worst, whose
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def raise_need(need, which, rows, row_at, iy, ix, z, above, owner, later):
     """Every place of the head that covers this column sees the new height."""
     ny, nx = need.shape

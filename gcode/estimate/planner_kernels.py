@@ -93,7 +93,7 @@ def seconds(planned):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def trapezoid(length, speed, accel, start, end):
     """Time of one move."""
     up = (speed * speed - start * start) / (2 * accel)

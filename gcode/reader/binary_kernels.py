@@ -8,7 +8,7 @@ from gcode.compiled import njit
 SIGNAL, PACK, UNPACK, RESET, NO_SPACES, SPACES = 255, 251, 250, 249, 247, 246
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def put(out, count, character, parameters, spaced):
     """One character, with a space before a parameter of a G-code; the new count, and `spaced`."""
     begins = count == 0 or out[count - 1] == 10

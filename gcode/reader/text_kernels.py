@@ -97,7 +97,7 @@ def parse(data, starts, letters, codes, kinds, words):
                 words[line, column] = sign * whole / scale if digits > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def heater_of(now, told):
     """Column of the heater that a line means, which tells a head or none; -1 where it is not there.
 
@@ -203,7 +203,7 @@ def run(kinds, codes, words, both_modes, g91_moves_e, tool_zeroes_e, offset, sta
             now[S_BED] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def chords(x0, y0, x1, y1, w, unit, clockwise):
     """Centre, start angle, sweep and number of chords of an arc; no chord if it is none."""
     if not np.isnan(w[R]):

@@ -10,7 +10,7 @@ from gcode.compiled import njit
 NO_COLUMN, HOLD_COLUMN, AIR_COLUMN, WANTED_COLUMN = 0, 1, 2, 3
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def kind_at(kind, row, column):
     """Of a column; nothing beyond the grid."""
     if row < 0 or column < 0 or row >= kind.shape[0] or column >= kind.shape[1]:

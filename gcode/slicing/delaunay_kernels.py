@@ -44,7 +44,7 @@ def in_circle(xy: Any, a: int, b: int, c: int, d: int) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def found_at(xy: Any, corners: Any, across: Any, p: int, begin: int, count: int) -> int:
     """The triangle that holds a point, by a walk from another one."""
     t = begin
@@ -69,7 +69,7 @@ def found_at(xy: Any, corners: Any, across: Any, p: int, begin: int, count: int)
     return begin
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def joined_to(across: Any, t: int, old: int, new: int) -> None:
     """Triangle `t` lies beside `new` where it lay beside `old`."""
     if t >= 0:
@@ -79,7 +79,7 @@ def joined_to(across: Any, t: int, old: int, new: int) -> None:
                 return
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def put_in(xy: Any, corners: Any, across: Any, at: Any, p: int, t: int, count: int) -> None:
     """Split the triangle that holds a point in three, and flip until no circle holds another."""
     a, b, c = corners[t, 0], corners[t, 1], corners[t, 2]

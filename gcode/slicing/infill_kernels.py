@@ -122,7 +122,7 @@ def chain_chords(low: Any, high: Any, first: Any, reach: float) -> tuple[Any, An
     return order, code
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def edges_by_row(points: Any, starts: Any, low: float, high: float) -> tuple[Any, Any, float]:
     """Edges of polygons by the rows that they reach into, and how many rows there are in a unit.
 

@@ -18,7 +18,7 @@ LEAF_RATIO = 1.2  # of a junction's radius: a shorter branch to a wall is its co
 NO_CENTRE_MM = 1e9  # where a triangle without area has its centre
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def samples(points: Any, starts: Any, apart: float) -> tuple[Any, Any, Any]:
     """Points along closed contours, at most `apart` from each other, in mid-stretch.
 
@@ -73,7 +73,7 @@ def axis_of(points: Any, starts: Any, apart: float, aside: float, facing: float)
     return axis_paths(samples_mm, owner, place, corners, across, points, starts, facing)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def axis_paths(
     samples_mm: Any,
     owner: Any,
@@ -142,7 +142,7 @@ def axis_paths(
     return nodes, radius, runs[:n], begins[: count + 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _centres(samples_mm: Any, corners: Any) -> tuple[Any, Any]:
     """Circumcentres and circumradii."""
     nodes = np.empty((len(corners), 2))
@@ -163,7 +163,7 @@ def _centres(samples_mm: Any, corners: Any) -> tuple[Any, Any]:
     return nodes, radius
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _links(
     samples_mm: Any,
     owner: Any,
@@ -211,7 +211,7 @@ def _links(
     return links, degree, order[:n]
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _link_to(links: Any, degree: Any, node: int, other: int) -> int:
     for k in range(degree[node]):
         if links[node, k] == other:
@@ -219,7 +219,7 @@ def _link_to(links: Any, degree: Any, node: int, other: int) -> int:
     return -1
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def _is_spur(nodes: Any, radius: Any, degree: Any, run: Any) -> bool:
     """A branch that ends at a wall, hardly longer than the junction it leaves is wide."""
     junction = 0.0
@@ -236,7 +236,7 @@ def _is_spur(nodes: Any, radius: Any, degree: Any, run: Any) -> bool:
     return bool(long < LEAF_RATIO * junction)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def apart_by(points: Any, least: float) -> Any:
     """Which points of a chain to keep so that they lie at least so far apart; its ends stay."""
     keep = np.zeros(len(points), np.bool_)
@@ -264,7 +264,7 @@ def ends_meet(runs: Any, begins: Any, nodes: int) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def wide_enough(along: Any, radius: Any, least: float) -> Any:
     """Where a wall along a chain is thick enough, and where it is taken for it.
 
@@ -288,7 +288,7 @@ def wide_enough(along: Any, radius: Any, least: float) -> Any:
     return wide
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def put_bead(
     points: Any, radius: Any, most: float, inset: float, apart: float, xy: Any, share: Any
 ) -> tuple[int, bool]:

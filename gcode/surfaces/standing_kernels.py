@@ -9,7 +9,7 @@ import numpy as np
 from gcode.compiled import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def across_row(ax: float, ay: float, bx: float, by: float, half: float, y: float) -> Any:
     """From where to where on a row at `y` lies within `half` of a stretch from a to b.
 
@@ -39,7 +39,7 @@ def across_row(ax: float, ay: float, bx: float, by: float, half: float, y: float
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def height_over(
     ax: float,
     ay: float,
@@ -82,13 +82,13 @@ def raise_by_beads(z: Any, start: Any, end: Any, half: Any, low: Any, cell: floa
                 z[iy, ix] = max(z[iy, ix], height_over(ax, ay, az, bx, by, bz, half[k], x, y))
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def rows_of(ay: float, by: float, half: float, low: float, cell: float, ny: int) -> Any:
     """First row whose middle a bead may cover, and the one after the last."""
     return columns_of(min(ay, by) - half, max(ay, by) + half, low, cell, ny)
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def columns_of(x_low: float, x_high: float, low: float, cell: float, nx: int) -> Any:
     """First cell whose middle lies between, and the one after the last."""
     if x_low > x_high:

@@ -21,6 +21,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
+from tests.draws import draws
 from tests.judge import HEADS, Verdict, cone_contact_mm, judge
 
 NOISE_MM, SPACING_MM = 0.04, 0.2
@@ -76,10 +77,7 @@ def _scan(solid: Solid, seed: int) -> Scan:
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(n, marks=pytest.mark.slow) if n in ("boss", "worn edge", "notch") else n
-        for n in TOOLS
-    ],
+    draws(TOOLS, "wall gap"),
 )
 def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
     tool, least_filled = TOOLS[name]
@@ -116,7 +114,7 @@ def test_a_piece_is_filled_as_an_outsider_sees_it(name: str) -> None:
     _assert_declared(declared / plan.deficit.missing_mm3, verdict)
 
 
-@pytest.mark.parametrize("width_mm", [2.0, 4.0])
+@pytest.mark.parametrize("width_mm", draws([2.0, 4.0], 2.0))
 def test_what_is_too_deep_for_the_head_is_filled_from_where_it_gets_in(width_mm: float) -> None:
     """A tenth of a millimetre from a wall's reach: nothing was begun, 12 to 17 % were filled.
 
@@ -149,9 +147,7 @@ DEEP = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("notch", marks=pytest.mark.slow), "slot", "wider slot"]
-)
+@pytest.mark.parametrize("name", draws(DEEP, "slot"))
 @pytest.mark.parametrize("printer", ["voron_2_4"])
 def test_what_the_head_alone_allows_is_filled_where_a_floor_is_near(
     name: str, printer: str

@@ -23,6 +23,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import LeftCause, PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
+from tests.draws import draws
 from tests.gcode_text import beads_of, points_of, steps_of
 from tests.integration.test_slicing_patch import motion_of
 
@@ -164,7 +165,7 @@ def test_a_span_too_long_is_told_with_its_length_and_volume() -> None:
     assert drawn[LeftCause.TOO_LONG] == pytest.approx(left.volume_mm3, rel=0.02)
 
 
-@pytest.mark.parametrize("gap_mm", [16.0, 26.0])
+@pytest.mark.parametrize("gap_mm", draws([16.0, 26.0], 16.0))
 def test_of_a_job_s_own_lines_none_hangs_from_one_end(gap_mm: float) -> None:
     # its lines at 45 degrees span 1.4 times the gap, and turn over the air
     part = OnLegs(gap_mm)
@@ -179,7 +180,7 @@ def test_of_a_job_s_own_lines_none_hangs_from_one_end(gap_mm: float) -> None:
 
 
 # of 34 mm they sag by 0.6 mm in the middle: the plate is 1 mm thick
-@pytest.mark.parametrize(("gap_mm", "least"), [(26.0, 0.95), (34.0, 0.8)])
+@pytest.mark.parametrize(("gap_mm", "least"), draws([(26.0, 0.95), (34.0, 0.8)], (26.0, 0.95)))
 def test_what_the_job_spans_a_repair_may_span(gap_mm: float, least: float) -> None:
     # regression: over 34 mm, which the job itself had bridged, 0.43 was laid and 0.41 filled
     part = OnLegs(gap_mm)

@@ -23,6 +23,7 @@ from gcode.slicing.patch import NOT_CLOSED, LeftCause, PatchPlan, slice_patch
 from gcode.slicing.patch_free import ASIDE_MM
 from gcode.surfaces import HeightField
 from gcode.writer import write
+from tests.draws import draws
 
 SETUP = load_setup()
 TOP_MM = 4.0
@@ -341,7 +342,7 @@ def test_a_region_that_would_stand_in_the_way_grows_together_with_its_neighbour(
     assert plan.reachable_mm3 >= 0.95 * (towers[0] + towers[1]).volume()
 
 
-@pytest.mark.parametrize("wall_mm", [71.5, 71.7, 71.9])
+@pytest.mark.parametrize("wall_mm", draws([71.5, 71.7, 71.9], 71.5))
 def test_a_gap_behind_a_wall_is_begun_from_the_air_in_front(wall_mm: float) -> None:
     # in the gap the tip is 0.1 mm too near to the wall, or not at all: 0.2 of it was filled
     base = m3.Manifold.cube((20.0, 30.0, 2.0)).translate((60.0, 60.0, 0.0))
@@ -362,7 +363,7 @@ def test_a_gap_behind_a_wall_is_begun_from_the_air_in_front(wall_mm: float) -> N
     assert after.minus(whole).volume_mm3 / gone.volume_mm3 <= 0.04
 
 
-@pytest.mark.parametrize("apart_mm", [1.8, 1.9, 2.0, 2.1])
+@pytest.mark.parametrize("apart_mm", draws([1.8, 1.9, 2.0, 2.1], 1.8, 2.0))
 def test_a_finished_region_stands_as_wide_as_its_beads_are(apart_mm: float) -> None:
     # 0.15 mm deep in the cone: the planner held the columns for what stands, the checker the beads
     left = m3.Manifold.cube((7.0, 9.0, 1.9)).translate((65.0, 70.0, TOP_MM))
@@ -520,7 +521,7 @@ def test_beads_grow_a_line_s_width_a_layer_out_over_what_is_out_of_reach() -> No
     assert (np.diff(wide) < 2 * 0.7 + ASIDE_MM).all()
 
 
-@pytest.mark.parametrize("higher_mm", [0.05, 0.1, 0.15])
+@pytest.mark.parametrize("higher_mm", draws([0.05, 0.1, 0.15], 0.1))
 def test_where_the_layers_lie_hardly_decides_how_much_of_a_pit_is_filled(higher_mm: float) -> None:
     """Beads over a hollow began at the layer after the one at which the head got in."""
     shares = []

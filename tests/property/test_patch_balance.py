@@ -12,6 +12,7 @@ from gcode.slicing.layers import LayerGrid
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.writer import write
+from tests.draws import draws
 from tests.judge import Verdict, judge
 
 SETUP = load_setup()
@@ -99,7 +100,7 @@ def assert_made_up(plan: PatchPlan, verdict: Verdict) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    [*list(CASES)[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in list(CASES)[3:])],
+    draws(CASES, "cup of two lines"),
 )
 def test_what_is_laid_and_what_is_left_out_make_up_what_is_missing(name: str) -> None:
     assert_made_up(*patched(*CASES[name]))

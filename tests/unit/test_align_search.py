@@ -30,6 +30,7 @@ from tests.analytic import (
     to_trimesh,
     union,
 )
+from tests.draws import draws
 
 SIGMA_MM = 0.04
 Points = Float[np.ndarray, "n 3"]
@@ -102,7 +103,7 @@ def test_a_small_notch_decides_between_poses() -> None:
     assert len(found.symmetric_alternatives) == 3
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("side", draws([1.0, -1.0], -1.0))
 def test_the_sensor_tells_on_which_side_of_a_plate_a_view_lies(side: float) -> None:
     plate = difference(box((0, 0, 0), (40, 24, 4)), cylinder((31, 7, -1), 4.0, 6.0))
     rng = np.random.default_rng(11)
@@ -188,7 +189,7 @@ def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> N
         aligned(template, points, options=QUICK_ALONE)
 
 
-@pytest.mark.parametrize("share_of_base", [1.0, 0.3])
+@pytest.mark.parametrize("share_of_base", draws([1.0, 0.3], 0.3))
 def test_the_larger_piece_of_a_bent_part_stands(
     share_of_base: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

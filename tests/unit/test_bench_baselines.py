@@ -18,6 +18,7 @@ from amrepair.bench.registry import BASELINES, PUBLISHED, make_method
 from amrepair.bench.samples import BenchClass, Format, Sample, read_points
 from amrepair.bench.synth_views import random_rotation
 from amrepair.errors import InputError
+from tests.draws import draws
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def sphere(rng: np.random.Generator, count: int, bump: bool) -> tuple[np.ndarray
     return unit * (50.0 + height)[:, None], (height > 0.2).astype(int)
 
 
-@pytest.mark.parametrize("name", BASELINES)
+@pytest.mark.parametrize("name", draws(BASELINES, "patchcore-fpfh", "btf-raw"))
 def test_a_bump_on_a_sphere_scores_higher(
     rng: np.random.Generator, tmp_path: Path, name: str
 ) -> None:

@@ -345,3 +345,85 @@ def test_the_collector_rests_while_a_kernel_is_compiled_and_is_as_it_was_afterwa
         gc.enable()
     assert seen
     assert not any(seen)
+
+
+LINKED = """
+import sys
+import numpy as np
+from gcode.compiled import all_from_disk, njit, prange
+
+@njit(inner=True, cache=True)
+def own(value):
+    if value < 0.0:
+        raise ValueError("too small", 7)
+    return min(value, 0.5)
+
+@njit(cache=True, parallel=True)
+def each(values):
+    found = np.zeros(len(values))
+    for k in prange(len(values)):
+        found[k] = own(values[k])
+    return found
+
+@njit(cache=True)
+def one(value):
+    return own(value) + 3.0
+
+@njit(cache=True)
+def other(value):
+    return own(value) - 3.0
+
+def said(kernel, value):
+    try:
+        return kernel(value)
+    except (ValueError, TypeError) as error:
+        return type(error).__name__, error.args[-1]
+
+print(each(np.array([0.2, 3.0])).tolist(), said(one, 0.25), said(one, -1.0), all_from_disk())
+if sys.argv[1:]:
+    print(said(other, 0.25), said(other, -1.0), said(own, 0.25)[0])
+"""
+
+
+def test_what_kernels_alone_call_is_in_the_code_of_each_that_calls_it(tmp_path: Path) -> None:
+    """Compiled with its first caller, loaded with it from disk, and loaded for another one."""
+    (tmp_path / "linked.py").write_text(LINKED)
+    told = [
+        subprocess.run(
+            [sys.executable, str(tmp_path / "linked.py"), *turn],
+            env={**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True, text=True, check=True,
+        ).stdout.splitlines()
+        for turn in ([], ["other"])
+    ]  # fmt: skip
+    found = "[0.2, 0.5] 3.25 ('ValueError', 7)"
+    assert told == [[f"{found} False"], [f"{found} True", "-2.75 ('ValueError', 7) TypeError"]]
+
+
+# Python calls them, too: their tests do.
+TESTED_ALONE = {"_paired_in_order", "inside", "triangles", "move_aside"}
+
+
+def test_no_kernel_that_kernels_alone_call_has_a_way_in() -> None:
+    """A way in from Python takes as long to compile as a small kernel does."""
+    kernels: dict[tuple[str, str], bool] = {}
+    asked: set[tuple[str, str]] = set()
+    for path in (p for top in ("gcode", "amrepair") for p in (ROOT / top).rglob("*.py")):
+        if "_kernels" not in (text := path.read_text()) and not path.stem.endswith("_kernels"):
+            continue
+        tree, rooms = ast.parse(text), dict[str, str]()
+        for node in ast.walk(tree):
+            if path.stem.endswith("_kernels") and isinstance(node, ast.FunctionDef):
+                said = [ast.unparse(option) for option in node.decorator_list]
+                if said and "inline='always'" not in said[0]:
+                    kernels[path.stem, node.name] = "inner=True" in said[0]
+            elif isinstance(node, ast.ImportFrom) and not path.stem.endswith("_kernels"):
+                for name in node.names:
+                    asked.add(((node.module or "").rpartition(".")[2], name.name))
+                    rooms[name.asname or name.name] = name.name
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                asked.add((rooms.get(node.value.id, ""), node.attr))
+    assert len(kernels) > 200
+    wrong = {kernel for kernel, inner in kernels.items() if inner == (kernel in asked)}
+    wrong = {kernel for kernel in wrong if kernel[1] not in TESTED_ALONE}
+    assert not wrong, "either `inner=True` is missing, or Python calls it"

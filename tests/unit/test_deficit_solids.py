@@ -25,6 +25,7 @@ from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
 from tests import analytic
 from tests.analytic import AnalyticTemplate
+from tests.draws import draws
 
 IN_PLACE = Transform.identity("build", "template")
 SIGMA_MM = 0.04
@@ -75,12 +76,7 @@ def deficit_of(scan: Scan, template: AnalyticTemplate, **options: float) -> Defi
 @pytest.mark.parametrize("with_normals", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "name",
-    [
-        "ball",
-        "notch",
-        "worn edge",
-        *(pytest.param(k, marks=pytest.mark.slow) for k in ("corner", "pit")),
-    ],
+    draws(["ball", "notch", "worn edge", "corner", "pit"], "notch", "worn edge"),
 )
 def test_a_cut_in_a_whole_part_cloud(name: str, with_normals: bool) -> None:
     built = BLOCK.body - CUTS[name]
@@ -94,8 +90,12 @@ def test_a_cut_in_a_whole_part_cloud(name: str, with_normals: bool) -> None:
     assert found.missing.status() == manifold3d.Error.NoError
 
 
-@pytest.mark.parametrize("sensors", [ABOVE, BOTH_SIDES], ids=["above", "both sides"])
-@pytest.mark.parametrize("name", [pytest.param("corner", marks=pytest.mark.slow), "pit", "void"])
+@pytest.mark.parametrize(
+    "sensors",
+    [ABOVE, pytest.param(BOTH_SIDES, marks=pytest.mark.slow)],
+    ids=["above", "both sides"],
+)
+@pytest.mark.parametrize("name", draws(["corner", "pit", "void"], "pit", "void"))
 def test_a_cut_seen_by_known_sensors(name: str, sensors: np.ndarray) -> None:
     cut = CUTS.get(name, cube((20, 10, 0.6), (10, 10, 9.4)))
     built = BLOCK.body - cut
@@ -153,7 +153,7 @@ def test_a_film_beside_a_deep_cut_is_found_with_it() -> None:
     assert (found.missing ^ film).volume() == pytest.approx(over_mm3, rel=0.05)
 
 
-@pytest.mark.parametrize("name", sorted(CUTS))
+@pytest.mark.parametrize("name", draws(sorted(CUTS), "notch", "pit"))
 def test_regions_that_detection_found_are_measured_by_solids(name: str) -> None:
     # regression: `amrepair detect` said 166 mm³ of a notch of 237 mm³ that `repair` measured right
     scan = cloud(BLOCK.body - CUTS[name])
@@ -190,7 +190,7 @@ SHEETS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param("pit", marks=pytest.mark.slow), "corner", "wall"])
+@pytest.mark.parametrize("name", draws(SHEETS, "corner"))
 def test_a_sheet_in_a_bare_cloud_faces_away_from_its_other_side(name: str) -> None:
     # regression: 0.91 of a pit, 0.85 of a corner, 0.86 before a wall; thinner than a cell,
     # and thicker than noise, its inner side was taken for the outer one
@@ -349,7 +349,7 @@ def test_a_deep_hole_whose_bottom_nobody_saw_is_open_where_rays_entered_it() -> 
     assert z_mm.min() >= 0.0
 
 
-@pytest.mark.parametrize(("long_mm", "high_mm"), [(4.0, 3.0), (1.5, 4.5)])
+@pytest.mark.parametrize(("long_mm", "high_mm"), draws([(4.0, 3.0), (1.5, 4.5)], (4.0, 3.0)))
 def test_excess_ends_where_rays_went_through(long_mm: float, high_mm: float) -> None:
     """What droops into a pocket: its slope went on in mid-air, above the part's top and all."""
     pocketed = analytic.difference(

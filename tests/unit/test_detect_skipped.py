@@ -24,6 +24,7 @@ from amrepair.scans import Scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
 from tests import analytic
+from tests.draws import draws
 
 SIGMA_MM = 0.03
 TOP_MM, WIDE_MM, HIGH_MM = 6.0, 0.42, 0.2
@@ -336,7 +337,7 @@ def test_of_a_scanner_that_errs_lines_are_told_over_longer_stretches(seed: int) 
     assert elsewhere_mm == 0.0
 
 
-@pytest.mark.parametrize("over_mm", [5.0, np.inf])
+@pytest.mark.parametrize("over_mm", draws([5.0, np.inf], 5.0))
 def test_where_errors_reach_as_far_over_their_length_no_line_is_told(over_mm: float) -> None:
     sigma_mm, length_mm = (0.13, 2.0) if np.isinf(over_mm) else (0.8, 8.0)
     lacks = erring(BLOCK.body - TWO_LINES, 1, sigma_mm, length_mm)
@@ -496,7 +497,9 @@ def strands(apart_mm: float, thick_mm: float, gone: range) -> tuple[m3.Manifold,
 
 
 @pytest.mark.parametrize("gone", [range(0), range(4, 5)])
-@pytest.mark.parametrize(("apart_mm", "thick_mm"), [(0.42, 0.25), (0.48, 0.28), (0.55, 0.3)])
+@pytest.mark.parametrize(
+    ("apart_mm", "thick_mm"), draws([(0.42, 0.25), (0.48, 0.28), (0.55, 0.3)], (0.48, 0.28))
+)
 def test_strands_over_a_shallow_pocket_are_there_though_its_floor_is_seen_between_them(
     apart_mm: float, thick_mm: float, gone: range
 ) -> None:

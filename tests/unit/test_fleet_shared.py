@@ -33,6 +33,7 @@ from amrepair.regions import AnomalyMap, detect
 from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import Scan
 from gcode.compiled import get_num_threads, set_num_threads
+from tests.draws import draws
 
 LONG_S = 200.0
 
@@ -118,7 +119,7 @@ def plan_of(scan: Scan, site: Site, small: Small) -> RepairPlan:
     return plan_repair(scan, site, title="t", guess=guess, strict=False)
 
 
-@pytest.mark.parametrize("stop", ["a layer", "the whole part"])
+@pytest.mark.parametrize("stop", draws(["a layer", "the whole part"], "a layer"))
 def test_shared_processes_come_to_the_same_bits(
     judges: Judges, asking: Asking, small: Small, stop: str
 ) -> None:

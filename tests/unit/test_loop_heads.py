@@ -20,6 +20,7 @@ from gcode.profiles import load_setup
 from gcode.reader import job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
+from tests.draws import draws
 
 HOT_C = (215.0, 220.0)
 
@@ -49,7 +50,7 @@ def small() -> Small:
     return replace(made, setup=setup, job=job, checked=checked)
 
 
-@pytest.mark.parametrize("after", [LAYER, LAYER + 1])
+@pytest.mark.parametrize("after", draws([LAYER, LAYER + 1], LAYER + 1))
 def test_a_pit_is_filled_by_the_head_that_is_there(
     after: int, small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

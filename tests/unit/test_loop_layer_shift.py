@@ -11,6 +11,7 @@ import pytest
 from amrepair.loop.layer_shift import ShiftOptions, Walls, layer_shift
 from gcode.moves import Program
 from gcode.reader import Job, read_job
+from tests.draws import draws
 
 LAYERS, HIGH_MM, WIDE_MM, SIDE_MM = 16, 0.2, 0.45, 20.0
 NOISE_MM = 0.06
@@ -84,7 +85,10 @@ STANDS = walls_of(lambda place, out: np.zeros(len(out)))
 
 @pytest.mark.parametrize(
     ("by_mm", "layers"),
-    [((0.5, 0.0), 1), ((0.0, -1.0), 2), ((-2.0, 2.0), 4), ((4.0, 0.0), 1), ((0.3, 0.3), 2)],
+    draws(
+        [((0.5, 0.0), 1), ((0.0, -1.0), 2), ((-2.0, 2.0), 4), ((4.0, 0.0), 1), ((0.3, 0.3), 2)],
+        *(((-2.0, 2.0), 4), ((0.3, 0.3), 2)),
+    ),
 )
 def test_layers_that_lie_aside_are_told_at_once(
     box: tuple[Job, int], by_mm: tuple[float, float], layers: int
@@ -128,8 +132,10 @@ def test_layers_are_no_farther_aside_than_views_are(box: tuple[Job, int]) -> Non
     assert layer_shift(cloud, low, NOISE_MM, job, line, between_views_mm=0.09) is None
 
 
-@pytest.mark.parametrize("share", [0.5, 0.0, 0.8, 1.0])
-@pytest.mark.parametrize("layers", [1, 4])
+@pytest.mark.parametrize(
+    ("share", "layers"),
+    draws(itertools.product([0.5, 0.0, 0.8, 1.0], [1, 4]), (0.0, 4), (0.5, 1), (0.8, 4)),
+)
 def test_layers_that_are_thin_or_gone_are_no_shift(
     box: tuple[Job, int], share: float, layers: int
 ) -> None:
@@ -143,7 +149,7 @@ def test_layers_that_are_thin_or_gone_are_no_shift(
     assert layer_shift(seen_from_above(job, thin), STANDS, NOISE_MM, job, line) is None
 
 
-@pytest.mark.parametrize("deep_mm", [0.5, 2.0, 6.0])
+@pytest.mark.parametrize("deep_mm", draws([0.5, 2.0, 6.0], 0.5))
 def test_what_broke_off_one_side_is_no_shift(box: tuple[Job, int], deep_mm: float) -> None:
     # where the layers were moved, what is gone on one side stands out on the other
     job, line = box
@@ -159,7 +165,7 @@ def test_what_broke_off_one_side_is_no_shift(box: tuple[Job, int], deep_mm: floa
     assert layer_shift(cloud, NO_WALLS, NOISE_MM, job, line) is None
 
 
-@pytest.mark.parametrize("sides", [1, 4])
+@pytest.mark.parametrize("sides", draws([1, 4], 1))
 def test_walls_tell_where_tops_are_as_they_should_be(box: tuple[Job, int], sides: int) -> None:
     # many layers later nothing but walls shows where the lower ones lie
     job, line = box

@@ -37,6 +37,7 @@ from gcode.reader import Beads, Job, job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 from tests import analytic
+from tests.draws import draws
 
 SETUP = load_setup(process="repair_0.20")
 LAYER_MM = 0.2
@@ -352,7 +353,7 @@ def test_a_tilt_that_walls_do_not_tell_is_none(tilt_deg: float, upright: bool) -
     assert is_upright(placed) == upright
 
 
-@pytest.mark.parametrize("moved_mm", [-0.15, 0.0, 0.1])
+@pytest.mark.parametrize("moved_mm", draws([-0.15, 0.0, 0.1], 0.0, 0.1))
 def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
     """regression: 'XY size compensation' of 0.1 mm made it another part, or one that lacks it."""
     outline = m3.CrossSection([[(0.0, 0.0), (18.0, 0.0), (18.0, 5.0), (7.0, 12.0), (0.0, 12.0)]])
@@ -367,7 +368,7 @@ def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
     assert (final.planned is not None) == (moved_mm != 0.0)
 
 
-@pytest.mark.parametrize("moved_mm", [0.0, -0.1])
+@pytest.mark.parametrize("moved_mm", draws([0.0, -0.1], 0.0))
 def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) -> None:
     """regression: a dome's were told moved by 0.1 mm, and its flanks not looked at in the end."""
     foot = m3.CrossSection.circle(9.0, 48)
@@ -384,7 +385,7 @@ def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) 
     assert (final.planned is not None) == (moved_mm != 0.0)
 
 
-@pytest.mark.parametrize("stretch", [-0.01, 0.015])
+@pytest.mark.parametrize("stretch", draws([-0.01, 0.015], -0.01))
 def test_a_job_that_is_stretched_for_what_shrinks_is_the_part_s(stretch: float) -> None:
     """regression: 0.5 % of a part of 60 mm made it another part, or laid it aside by as much."""
     outline = m3.CrossSection([[(0.0, 0.0), (60.0, 0.0), (60.0, 9.0), (20.0, 30.0), (0.0, 30.0)]])

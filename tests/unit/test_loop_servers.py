@@ -17,6 +17,7 @@ from amrepair.loop.sites import sites
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan
 from gcode.hosts.modes import Modes, follow
+from tests.draws import draws
 
 
 class Following(FakeOctoPrint):
@@ -88,7 +89,7 @@ def whole(small: Small, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return folder, fake.printed
 
 
-@pytest.mark.parametrize("state", ["never begun", "under way", "over"])
+@pytest.mark.parametrize("state", draws(["never begun", "under way", "over"], "under way"))
 @pytest.mark.parametrize("kind", ["repair", pytest.param("park", marks=pytest.mark.slow)])
 def test_a_killed_loop_goes_on_over_a_server(
     small: Small,

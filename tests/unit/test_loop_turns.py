@@ -27,6 +27,7 @@ from gcode.errors import CheckRefusedError
 from gcode.reader import job_for
 from gcode.resumption.head import state_at_rest
 from gcode.resumption.resume_at import resume_at
+from tests.draws import draws
 
 # The tall one stands between the low one and the park, at X 10, Y 200, Z 20.
 TALL, LOW = Tower(92.0, 112.0, (16.0, 16.0, 25.0)), Tower(178.0, 46.0, (16.0, 14.0, 3.0))
@@ -199,12 +200,7 @@ def run(made: InTurn, folder: Path, scans: object, stops: tuple[Stop, ...]) -> t
 
 @pytest.mark.parametrize(
     "broken",
-    [
-        None,
-        "layer-004",
-        "final-2",
-        *(pytest.param(f"layer-0{k}", marks=pytest.mark.slow) for k in (24, 44)),
-    ],
+    draws([None, "layer-004", "final-2", "layer-024", "layer-044"], None, "layer-004"),
 )
 def test_a_void_is_filled_in_its_own_object_and_nowhere_else(
     three: InTurn, tmp_path: Path, broken: str | None
@@ -267,7 +263,7 @@ def test_a_run_keeps_the_head_off_what_is_finished_on_every_way_it_sends(
     assert hits(sent[begun:], TALL, SETUP) == []
 
 
-@pytest.mark.parametrize("more_mm", [0.0, 4.0])
+@pytest.mark.parametrize("more_mm", draws([0.0, 4.0], 4.0))
 def test_what_a_scan_shows_of_a_finished_one_keeps_the_head_off_too(
     tmp_path: Path, more_mm: float
 ) -> None:

@@ -44,11 +44,11 @@ PARTS = {
 }
 SPACING_MM2 = {"with a sheet across its hole": 0.2, "tall vase": 0.35, "tower": 0.5}
 CASES = [
-    ("tall vase", 32.0, True),
+    pytest.param("tall vase", 32.0, True, marks=pytest.mark.slow),
     pytest.param("tower", 18.0, True, marks=pytest.mark.slow),
     pytest.param("cylinder", 8.0, True, marks=pytest.mark.slow),
     pytest.param("with a hollow above", 5.0, True, marks=pytest.mark.slow),
-    ("with a sheet across its hole", 8.0, True),
+    pytest.param("with a sheet across its hole", 8.0, True, marks=pytest.mark.slow),
     ("block", 2.0, False),
     pytest.param("cylinder", 3.0, False, marks=pytest.mark.slow),
     pytest.param("block", 5.0, True, marks=pytest.mark.slow),

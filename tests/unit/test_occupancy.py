@@ -23,6 +23,7 @@ from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
 from tests import analytic
+from tests.draws import draws
 from tests.unit.loop_bench import solid_mesh
 
 PLACED = Transform.identity("build", "template")
@@ -216,7 +217,7 @@ def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
     assert emptied_mm3[1] == 0.0
 
 
-@pytest.mark.parametrize("stood_mm", [-14.7, -16.5])
+@pytest.mark.parametrize("stood_mm", draws([-14.7, -16.5], -14.7))
 def test_a_dent_at_the_rim_of_what_nobody_saw_does_not_take_it_along(stood_mm: float) -> None:
     """Regression: a ball seen down to where it stood, and a dent there of 100 mm³ was 2,293."""
     radius_mm, deep_mm, ball_mm = 21.0, 2.5, 7.5
@@ -255,7 +256,7 @@ def test_a_dent_beside_a_bump_that_nobody_saw_does_not_take_it_along() -> None:
     assert deficit.missing_mm3 == pytest.approx((part ^ cut).volume(), rel=0.1)
 
 
-@pytest.mark.parametrize("seen_mm", [20.0, 26.0])
+@pytest.mark.parametrize("seen_mm", draws([20.0, 26.0], 20.0))
 def test_a_notch_at_the_end_of_the_view_does_not_take_the_rest_along(seen_mm: float) -> None:
     # regression: where the view ended within a notch, all that it had not seen was told missing,
     # 27 times what was; of the head's way past it, too, nothing stood there
@@ -271,7 +272,9 @@ def test_a_notch_at_the_end_of_the_view_does_not_take_the_rest_along(seen_mm: fl
 
 
 @pytest.mark.parametrize(
-    ("size", "at"), [((9, 9, 12), (33, 17, -1)), ((8, 8, 12), (16, 8, -1))], ids=["corner", "hole"]
+    ("size", "at"),
+    draws([((9, 9, 12), (33, 17, -1)), ((8, 8, 12), (16, 8, -1))], ((8, 8, 12), (16, 8, -1))),
+    ids=["corner", "hole"],
 )
 def test_what_is_gone_down_to_an_unseen_underside_is_measured(
     size: tuple[float, float, float], at: tuple[float, float, float]

@@ -20,6 +20,7 @@ from gcode.slicing.options import DEFAULT_PATCH
 from gcode.slicing.patch import PatchPlan, slice_patch
 from gcode.surfaces import HeightField
 from gcode.surfaces.lines import heights_by_lines, near_lines
+from tests.draws import draws
 
 SETUP = load_setup()
 PARK = (10.0, 200.0, 20.0)
@@ -219,7 +220,7 @@ def test_over_open_cells_a_line_gets_what_the_job_laid_there(rounded_mm: float) 
     assert plan.beads_mm3 == pytest.approx(DEFAULT_PATCH.beads.bond_ratio * laid, rel=0.12)
 
 
-@pytest.mark.parametrize("high_mm", [0.1, 0.12, 0.15, 0.2])
+@pytest.mark.parametrize("high_mm", draws([0.1, 0.12, 0.15, 0.2], 0.1, 0.2))
 def test_what_is_gone_of_many_thin_layers_is_filled_from_the_floor_up(high_mm: float) -> None:
     # regression: where the next layer's bead is as thick as two layers, each layer of a hole left
     # its own to the next one; of a chip through 17 layers of 0.1 mm a lid alone was laid

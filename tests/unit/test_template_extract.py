@@ -14,6 +14,7 @@ from amrepair.template.extract import extract_mesh
 from amrepair.template.mesh_sdf import MeshSdf
 from amrepair.template.port import Template
 from gcode.solids import as_manifold, is_valid
+from tests.draws import draws
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,7 @@ def ball() -> MeshSdf:
     return MeshSdf.from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=10.0))
 
 
-@pytest.mark.parametrize("level_mm", [-0.5, 0.0, 0.5])
+@pytest.mark.parametrize("level_mm", draws([-0.5, 0.0, 0.5], 0.5))
 def test_a_level_of_a_ball_is_a_ball(ball: MeshSdf, level_mm: float) -> None:
     mesh = extract_mesh(ball, 0.4, level_mm=level_mm)
     truth_mm3 = 4 / 3 * np.pi * (10.0 + level_mm) ** 3

@@ -34,6 +34,7 @@ from amrepair.simulate.run import PreparedRun
 from gcode.hosts.file import FilePrinter
 from gcode.resumption.standing import standing_field
 from gcode.surfaces import HeightField
+from tests.draws import draws
 
 LAYER = 9
 NONE = np.zeros((0, 3))
@@ -153,7 +154,7 @@ def test_repeated_touches_tell_the_noise(share: float, true: float, seed: int) -
     assert measured_sigma_mm(np.array([3.0]), share * true) == pytest.approx(share * true)
 
 
-@pytest.mark.parametrize("radius_mm", [1.5, 2.5, 4.0])
+@pytest.mark.parametrize("radius_mm", draws([1.5, 2.5, 4.0], 1.5))
 def test_the_rim_of_a_hole_is_told_without_bias(radius_mm: float) -> None:
     """A flat finds a hole smaller by its radius all round; said of touches that is made good."""
     flats, ratios = square(20.0), []
@@ -214,7 +215,9 @@ def test_sound_layers_raise_nothing_over_many_seeds(
     assert clean_regions(run, site, stop, range(10, 210)) <= 19
 
 
-@pytest.mark.parametrize(("x_mm", "y_mm", "depth_mm"), [(3.0, 2.0, 0.2), (-8.0, -3.5, 0.4)])
+@pytest.mark.parametrize(
+    ("x_mm", "y_mm", "depth_mm"), draws([(3.0, 2.0, 0.2), (-8.0, -3.5, 0.4)], (3.0, 2.0, 0.2))
+)
 def test_a_void_is_found_by_sixty_touches_and_measured(
     run: PreparedRun, stop: Stop, site: Site, x_mm: float, y_mm: float, depth_mm: float
 ) -> None:

@@ -6,6 +6,8 @@ of 13.75 mm³ from above, 59 of 13.75 and 73 of 50 mm³ aslant).
 
 from __future__ import annotations
 
+import itertools
+
 import manifold3d as m3
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from amrepair.deficit import compute_deficit
 from amrepair.frames import Transform
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
+from tests.draws import draws
 from tests.unit.loop_bench import scan_of, solid_mesh
 from tests.unit.test_most_is_gone import points_on
 
@@ -29,8 +32,14 @@ CUTS = {
 }
 
 
-@pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize(
+    ("cut", "view"),
+    draws(
+        itertools.product(CUTS, VIEWS),
+        *(("pocket", "from above"), ("pocket beside a wall", "aslant"), ("edge", "aslant")),
+        ("corner", "from above"),
+    ),
+)
 def test_only_what_is_broken_is_missing(cut: str, view: str) -> None:
     corner, size = CUTS[cut]
     gone = m3.Manifold.cube(size).translate(corner) ^ BLOCK
