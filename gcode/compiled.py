@@ -57,6 +57,7 @@ import numba.np.linalg
 import numpy as np
 from llvmlite.binding import ffi
 from numba import get_num_threads, prange, set_num_threads, types
+from numba import version_info as numba_version
 from numba.core import bytecode, event
 from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
@@ -88,6 +89,8 @@ LONGEST_COMPILE_S = 60.0
 COMPILE_POLL_S = 0.02
 # What a process makes while it compiles all kernels is some ten thousand functions.
 _PLACE_BITS, _COUNT_BITS = 40, 20
+# How numba links what it compiles is its own affair: what is changed there is tested with this one.
+_PROVEN_WITH = (0, 68)
 _LINKED_ONLY = "linked only"
 _CONSTANTS_PREFIX = "_ZN08NumbaEnv"  # as numba names where a function's constants are
 
@@ -245,7 +248,11 @@ def machine_code_at_the_end() -> None:
     By itself it does both with each function that a kernel calls, and then with the kernel and all
     of them in it again; with a `prange` four times. Where code is linked alone, the places that
     refer to a function's constants are there only with the kernel's own code, and are set then.
+    A numba of another release than `_PROVEN_WITH` is left as it is: its kernels take longer to
+    compile.
     """
+    if numba_version[:2] != _PROVEN_WITH:
+        return
     kinds: tuple[Any, ...] = (BaseContext, BaseNativeLowering, CPUContext, parallel, JITCPUCodegen)
     base, native, context, loops, codegen = kinds
     own, lower = base._compile_subroutine_no_cache, native.run_pass
