@@ -111,6 +111,8 @@ class Labelling:
     unexplained
         (k,) how little the scan's points explain a facet, whichever way broken surface faces:
         0 where points lie on it, 1 where none is near.
+    beside
+        (v,) how many points of the template's surface lie at each voxel: `points_beside`.
     """
 
     scan: ScannedSpace
@@ -118,6 +120,7 @@ class Labelling:
     facets: Facets
     watched: WatchedSurface
     unexplained: Values
+    beside: Float[np.ndarray, " v"]
 
     def empty(self) -> Mask:
         """(v,) what is empty by the cheapest of the labellings that are tried.
@@ -129,7 +132,7 @@ class Labelling:
         scan, sides = self.scan, OpenSides.of(self.scan, self.grid)
         least = np.pi * scan.options.bead_mm**2 / scan.spacing_mm**2
         told = unknown = np.zeros(len(sides.ahead))
-        first = MinimumCut.of(self.facets, self._nats(unknown, unknown), _told(scan, self.grid))
+        first = MinimumCut.of(self.facets, self._nats(unknown, unknown), self._told())
         nats, empty = self._facing(told, self._open_side(first.empty), first, sides)
         for _ in range(MOST_ROUNDS):
             known, before_nats, best = self._open_side(empty), nats, told
@@ -145,6 +148,28 @@ class Labelling:
                 break
             told = best
         return empty
+
+    def _told(self) -> Float[np.ndarray, " v"]:
+        """(v,) what is known of each voxel by itself, nats: positive solid, negative empty.
+
+        As designed, a little; behind a point on the template's surface solid and before it empty,
+        but for strays; and beyond the box as designed.
+        """
+        scan, grid, inside = self.scan, self.grid, self.grid.is_inside
+        deep_mm = scan.options.deep_extents * float(np.ptp(scan.template.bounds_mm, axis=0).max())
+        facet = (grid.voxel_mm / scan.spacing_mm) ** 2
+        told = np.where(inside, 1.0, -1.0) * grid.voxel_mm / deep_mm
+        told -= np.log(scan.options.stray) * self.beside
+        for axis in range(3):
+            for end in (0, -1):
+                face = np.take(grid.number, end, axis=axis)
+                outer = (-1, grid.number.shape[axis])[end]
+                at = np.insert(np.argwhere(face >= 0), axis, outer, axis=1)
+                beyond = scan.template.distance(grid.low_mm + (at + 0.5) * grid.voxel_mm) < 0
+                face = face[face >= 0]
+                same = beyond == inside[face]  # else the template's surface lies between
+                told[face[same]] += np.where(beyond[same], facet, -facet)
+        return told
 
     def _open_side(self, empty: Mask) -> Float[np.ndarray, " q"]:
         """(q,) on which side of broken surface space is empty, 1 ahead and −1 behind; else 0."""
@@ -268,33 +293,10 @@ def _farness(
     return far
 
 
-def _told(scan: ScannedSpace, grid: VoxelGrid) -> Float[np.ndarray, " v"]:
-    """(v,) what is known of each voxel by itself, nats: positive solid, negative empty.
-
-    As designed, a little; behind a point on the template's surface solid and before it empty, but
-    for strays; and beyond the box as designed. Points within a voxel of broken surface tell nothing
-    of the voxels there: those are solid in part.
-    """
-    inside = grid.is_inside
-    deep_mm = scan.options.deep_extents * float(np.ptp(scan.template.bounds_mm, axis=0).max())
-    facet = (grid.voxel_mm / scan.spacing_mm) ** 2
-    told = np.where(inside, 1.0, -1.0) * grid.voxel_mm / deep_mm
-    told -= np.log(scan.options.stray) * points_beside(scan, grid)
-    for axis in range(3):
-        for end in (0, -1):
-            face = np.take(grid.number, end, axis=axis)
-            at = np.insert(np.argwhere(face >= 0), axis, (-1, grid.number.shape[axis])[end], axis=1)
-            beyond = scan.template.distance(grid.low_mm + (at + 0.5) * grid.voxel_mm) < 0
-            face = face[face >= 0]
-            same = beyond == inside[face]  # else the template's surface lies between
-            told[face[same]] += np.where(beyond[same], facet, -facet)
-    return told
-
-
 def points_beside(scan: ScannedSpace, grid: VoxelGrid) -> Float[np.ndarray, " v"]:
     """(v,) how many points of the template's surface lie at each voxel: negative of those outside.
 
-    Points within a voxel of broken surface do not count.
+    Points within a voxel of broken surface tell nothing: voxels there are solid in part.
     """
     inside = grid.is_inside
     beside = np.zeros(len(inside))

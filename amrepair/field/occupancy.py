@@ -77,10 +77,13 @@ def find_occupancy(
     watched = WatchedSurface(normals, seen, np.full(len(seen), area_per_point(places_mm)))
     scan = replace(scan, on_mm=on_mm[in_box(on_mm, *box_mm)])
     facets = facets_of(grid)
-    sought = Labelling(scan, grid, facets, watched, unexplained(scan, facets, grid.voxel_mm))
+    beside = points_beside(scan, grid)
+    sought = Labelling(
+        scan, grid, facets, watched, unexplained(scan, facets, grid.voxel_mm), beside
+    )
     solid = grid.labelled(sought.empty()).solid
     found = _as_seen(solid, scan, grid)
-    found &= ~_held_by_strays(found, scan, grid)
+    found &= ~_held_by_strays(found, beside, scan, grid)
     found |= _guessed(found, (*surface, seen), replace(scan, on_mm=on_mm), grid)
     return Occupancy(grid.low_mm, grid.voxel_mm, found, grid.f_mm < 0)
 
@@ -132,17 +135,19 @@ def _as_seen(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask
     return found
 
 
-def _held_by_strays(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask:
+def _held_by_strays(
+    solid: VoxelMask, beside: Float[np.ndarray, " v"], scan: ScannedSpace, grid: VoxelGrid
+) -> VoxelMask:
     """Lumps in the template that hang together with nothing else, and are no larger than a stray.
 
     Where a part is gone some points stray to where its surface was. Each holds a voxel, but makes
     no surface: on that half as many points as expected lie at least.
     """
-    beside = np.zeros(solid.shape)
-    beside[grid.number >= 0] = points_beside(scan, grid)
+    points = np.zeros(solid.shape)
+    points[grid.number >= 0] = beside
     few = 0.5 * (grid.voxel_mm / scan.spacing_mm) ** 2
     every = np.ones((3, 3, 3), bool)
-    stray = ndimage.binary_dilation((beside > 0) & (beside < few), every)
+    stray = ndimage.binary_dilation((points > 0) & (points < few), every)
     lump, count = ndimage.label((grid.f_mm < 0) & solid, every)
     larger = np.zeros(count + 1, bool)
     larger[lump[~stray]] = True
