@@ -184,9 +184,7 @@ def lock_untold() -> None:
 
 def loops_without_ways_in() -> None:
     """Compile the body of a `prange` with no way in from Python: its threads call it directly."""
-    body: Any = getattr(parfor_lowering, "_create_gufunc_for_parfor_body", None)
-    if "flags" not in getattr(getattr(body, "__code__", None), "co_varnames", ()):
-        return  # a numba that does it otherwise
+    body: Any = cast(Any, parfor_lowering)._create_gufunc_for_parfor_body
     asked = inspect.signature(body)
 
     def without(*values: Any, **named: Any) -> Any:
@@ -248,11 +246,7 @@ def machine_code_at_the_end() -> None:
     By itself it does both with each function that a kernel calls, and then with the kernel and all
     of them in it again; with a `prange` four times. Where code is linked alone, the places that
     refer to a function's constants are there only with the kernel's own code, and are set then.
-    A numba of another release than `_PROVEN_WITH` is left as it is: its kernels take longer to
-    compile.
     """
-    if numba_version[:2] != _PROVEN_WITH:
-        return
     kinds: tuple[Any, ...] = (BaseContext, BaseNativeLowering, CPUContext, parallel, JITCPUCodegen)
     base, native, context, loops, codegen = kinds
     own, lower = base._compile_subroutine_no_cache, native.run_pass
@@ -334,8 +328,9 @@ cast(Any, event).register("numba:compile", _without_collector)
 shapes_unsaid()
 options_at_once()
 lock_untold()
-loops_without_ways_in()
-machine_code_at_the_end()
+if numba_version[:2] == _PROVEN_WITH:  # with another release kernels only take longer to compile
+    loops_without_ways_in()
+    machine_code_at_the_end()
 
 
 def all_from_disk() -> bool:
