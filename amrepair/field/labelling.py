@@ -79,7 +79,7 @@ class OpenSides:
             for way in (1.0, -1.0)
         )
         # of a wide facet's many places together no more is known than of a facet that nobody saw
-        most = -np.log1p(-options.largest_cover) / (grid.voxel_mm / scan.spacing_mm) ** 2
+        most = -np.log1p(-options.largest_cover) / scan.points_on_facet(grid.voxel_mm)
         return cls(broken.plane, ahead, behind, float(min(-np.log(options.stray), most)))
 
     def proposals(self) -> Iterator[Float[np.ndarray, " q"]]:
@@ -157,7 +157,7 @@ class Labelling:
         """
         scan, grid, inside = self.scan, self.grid, self.grid.is_inside
         deep_mm = scan.options.deep_extents * float(np.ptp(scan.template.bounds_mm, axis=0).max())
-        facet = (grid.voxel_mm / scan.spacing_mm) ** 2
+        facet = scan.points_on_facet(grid.voxel_mm)
         told = np.where(inside, 1.0, -1.0) * grid.voxel_mm / deep_mm
         told -= np.log(scan.options.stray) * self.beside
         for axis in range(3):
@@ -223,7 +223,7 @@ def _nats(
     ways = np.stack([np.eye(3), -np.eye(3)], axis=1).reshape(-1, 3)
     options, area_mm2 = scan.options, watched.area_mm2
     cover = cover_of(ways, watched.outward, area_mm2, watched.seen * area_mm2, options)
-    points = (grid.voxel_mm / scan.spacing_mm) ** 2
+    points = scan.points_on_facet(grid.voxel_mm)
     chance = np.minimum(cover, options.largest_cover) * (1.0 - np.exp(-points))
     return np.asarray(-np.log1p(-chance).reshape(3, 2)[facets.axis] * unexplained)
 

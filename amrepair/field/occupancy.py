@@ -145,7 +145,7 @@ def _held_by_strays(
     """
     points = np.zeros(solid.shape)
     points[grid.number >= 0] = beside
-    few = 0.5 * (grid.voxel_mm / scan.spacing_mm) ** 2
+    few = 0.5 * scan.points_on_facet(grid.voxel_mm)
     every = np.ones((3, 3, 3), bool)
     stray = ndimage.binary_dilation((points > 0) & (points < few), every)
     lump, count = ndimage.label((grid.f_mm < 0) & solid, every)

@@ -153,6 +153,10 @@ class ScannedSpace:
         half = int(0.5 * np.pi * self.options.seen_spacings**2)
         return has_near(asked_mm, self.on_mm, within_mm, enough=half)
 
+    def points_on_facet(self, voxel_mm: float) -> float:
+        """How many points lie on a voxel's side, at the scan's density."""
+        return (voxel_mm / self.spacing_mm) ** 2
+
     def width_mm(self, voxel_mm: float) -> float:
         """How far from its points surface may be put; steps of voxels by up to half of one more."""
         return self.options.gap_spacings * self.spacing_mm + 0.6 * voxel_mm
