@@ -163,6 +163,7 @@ def run_without_wire(
         stops=stops,
         options=LoopOptions(policy=POLICY, seed=prepared.seed),
     )
+    stage.finish(measure=True)  # a layer whose flow was changed is printed after the last look
     return report, stage.truth[0]
 
 

@@ -188,9 +188,18 @@ class Stage:
             self._break(request)
         self._measure(request.label)
 
-    def finish(self) -> None:
-        """Lay what was printed after the last look."""
+    def finish(self, *, measure: bool = False) -> None:
+        """Lay what was printed after the last look.
+
+        Parameters
+        ----------
+        measure
+            Whether to measure the last stop's defects once more: what was too thin for beads of its
+            own is filled by the next layer's.
+        """
         self._print_job(self._take_motion())
+        if measure and self._stops:
+            self._measure(self._stops[-1])
 
     def _print_job(self, motion: MotionBatch) -> None:
         """The same motion, in the world with its defects and in the reference without."""

@@ -205,11 +205,11 @@ def test_truth_says_how_even_a_repair_is_and_what_it_added() -> None:
 
 
 def test_truth_counts_what_each_layer_of_a_defect_took_away() -> None:
-    def lines(z: float) -> MotionBatch:
+    def lines(z: float, flow: float = 1.0) -> MotionBatch:
         y = 20.0 + 0.4 * np.arange(20)
         start = np.column_stack([np.full(20, 20.0), y, np.full(20, z)])
         end = start + np.array([10.0, 0.0, 0.0])
-        pushed = np.full(20, 10.0 * 0.4 * 0.2 / (np.pi / 4 * 1.75**2))
+        pushed = np.full(20, flow * 10.0 * 0.4 * 0.2 / (np.pi / 4 * 1.75**2))
         return MotionBatch(start, end, pushed, np.full(20, 50.0), np.arange(20) * 1.0)
 
     world = World((60.0, 60.0))
@@ -230,3 +230,8 @@ def test_truth_counts_what_each_layer_of_a_defect_took_away() -> None:
     assert both.label == "layer-001"
     assert both.missing_mm3 == pytest.approx(2 * one_layer_mm3, rel=0.1)
     assert both.filled_mm3 == pytest.approx(first.filled_mm3)  # the second is still open
+    waiting += [lines(0.6, flow=2.0), MotionBatch.concatenate([])]
+    stage.finish()
+    assert stage.truth[0].filled_mm3 == both.filled_mm3  # as it was at its own stop
+    stage.finish(measure=True)
+    assert stage.truth[0].filled_mm3 > both.filled_mm3 + 0.3 * one_layer_mm3  # the next layer's
