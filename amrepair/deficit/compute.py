@@ -23,7 +23,7 @@ from amrepair.deficit.boxes import Sought
 from amrepair.deficit.heights import as_built_heights, standing_heights, with_what_stands_out
 from amrepair.deficit.options import DEFAULT_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
-from amrepair.deficit.walls import with_rims, with_sharp_walls
+from amrepair.deficit.walls import as_low_as_seen, with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
 from amrepair.field.groups import area_per_point
 from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
@@ -256,7 +256,10 @@ def _standing(
         solid, lost_mm > 0, points_mm, scan.sigma_mm, options.walls, deviation_mm=deviation_mm
     )
     known = with_what_stands_out(sharp, points_mm, scan.sigma_mm, spacing_mm, options.heights)
-    return with_rims(known, lost_mm, designed_mm, spacing_mm, options.walls)
+    whole = with_rims(known, lost_mm, designed_mm, spacing_mm, options.walls)
+    return as_low_as_seen(
+        whole, lost_mm > 0, points_mm, scan.sigma_mm, spacing_mm, deviation_mm, options.walls
+    )
 
 
 def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...]:

@@ -162,6 +162,13 @@ class WallOptions:
     sound_mm, least_sound, uneven_mm
         Beyond that a top is looked at over `sound_mm`, at `least_sound` columns or more; it is
         even if it varies by no more than `uneven_mm`.
+    steepest
+        Rise by run of what counts as a floor: 63°, about as steep as plastic wears.
+    bare_p
+        The chance at most that what stands shows no point where the scan should have some.
+    behind_cells, deepest_cells
+        A column that the solids left standing goes only if broken surface lies within so many
+        columns behind it; and so many go at most, one behind the other. Their rounding is no wider.
     """
 
     step_mm: float = 0.3
@@ -185,6 +192,10 @@ class WallOptions:
     sound_mm: float = 0.8
     least_sound: int = 20
     uneven_mm: float = 0.04
+    steepest: float = 2.0
+    bare_p: float = 0.001
+    behind_cells: int = 5
+    deepest_cells: int = 6
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,6 +73,50 @@ def with_sharp_walls(
     return replace(field, z_mm=z_mm)
 
 
+def as_low_as_seen(
+    field: HeightField,
+    gone: ColumnMask,
+    points_mm: Points,
+    sigma_mm: float,
+    spacing_mm: float,
+    deviation_mm: Values,
+    options: WallOptions = DEFAULT_DEFICIT.walls,
+) -> HeightField:
+    """Lower what the solids leave standing where the scan shows it gone, beside what is missing.
+
+    Solids round off the edges of what is missing: floors read some tenths of a millimetre too high
+    at the foot of a slope, and the corners of a pit stand as high as its walls. So floors are taken
+    from the points on them; and a column goes where points would lie on it and do not, if broken
+    surface lies behind it. Where the scan has no points, nothing changes. `gone`, `points_mm` and
+    `deviation_mm` are those of `with_sharp_walls`.
+    """
+    if not gone.any() or sigma_mm <= 0:
+        return field
+    window = window_around(gone, options.beside_cells + options.behind_cells)
+    z_mm = np.array(field.z_mm, dtype=np.float64)
+    near, lost = np.ascontiguousarray(z_mm[window]), np.ascontiguousarray(gone[window])
+    corner_mm = field.origin_mm + np.array([window[1].start, window[0].start]) * field.cell_mm
+    inside = deviation_mm < -options.inside_sigma * sigma_mm
+    seen, broken = (
+        _by_cell(of, corner_mm, field.cell_mm, near.shape) for of in (points_mm, points_mm[inside])
+    )
+    may = ndimage.maximum_filter(lost, 2 * options.beside_cells + 1)
+    # points on a lip are of its top and of its wall, and tell no floor
+    across = 2 * math.ceil(options.radius_mm / field.cell_mm) + 1
+    lip = near - ndimage.minimum_filter(near, across) > options.rounded_mm + options.radius_mm
+    at = tuple(map(np.ascontiguousarray, (lost & ~lip).nonzero()))
+    near[at] = kernels.floors(
+        near, *at, seen, corner_mm, field.cell_mm, options.radius_mm, options.rounded_mm,
+        options.most_spread_sigma * sigma_mm, options.steepest,
+    )  # fmt: skip
+    z_mm[window] = kernels.carved(
+        near, lost, may, seen, broken, corner_mm, field.cell_mm, options.over_foot_sigma * sigma_mm,
+        math.sqrt(0.5) * field.cell_mm + sigma_mm, spacing_mm, -math.log(options.bare_p),
+        options.behind_cells, options.deepest_cells,
+    )  # fmt: skip
+    return replace(field, z_mm=z_mm)
+
+
 def with_rims(
     field: HeightField,
     lost_mm: HeightMap,

@@ -17,6 +17,8 @@ STEEPEST_CELL_MM = 0.15
 # No farther off a plane's ends may be told to lie on two sides of a column's middle: three standard
 # deviations of the mean of some twenty points.
 EVEN_ENDS_MM = 0.03
+# Of a radius: the middle of the points that tell a floor lies no farther off the column's.
+OFF_MIDDLE = 0.4
 
 
 class PointsByCell(NamedTuple):
@@ -193,3 +195,107 @@ def extended(z, iy, ix, sound, reach, least, spread):
         if square - plane @ first <= spread * spread * count:
             out[q] = z[i, j] + plane[0]
     return out
+
+
+@njit(cache=True, nogil=True)
+def floors(z, iy, ix, seen, origin, cell, radius, band, most_spread, steepest):
+    """(q,) heights of the columns asked about, on planes through the points around each.
+
+    Points within `radius` of a column's middle tell its floor if they lie around it, no farther
+    from their plane than `most_spread` on average, and no more than `band` lower or higher than it
+    is told to be, further as their distance. A column beside something higher keeps its height.
+    """
+    start, points = seen
+    ny, nx = z.shape
+    out = np.empty(len(iy))
+    reach = int(np.ceil(radius / cell))
+    far = band + radius
+    for q in range(len(iy)):
+        i, j = iy[q], ix[q]
+        out[q] = z[i, j]
+        x, y = origin[0] + (j + 0.5) * cell, origin[1] + (i + 0.5) * cell
+        second, first, square, highest = np.zeros((3, 3)), np.zeros(3), 0.0, -np.inf
+        for row in range(max(i - reach, 0), min(i + reach + 1, ny)):
+            for k in range(start[row, max(j - reach, 0)], start[row, min(j + reach + 1, nx)]):
+                a, b, off = points[k, 0] - x, points[k, 1] - y, points[k, 2] - z[i, j]
+                if a * a + b * b > radius * radius or off < -far:
+                    continue
+                highest = max(highest, off)
+                at = np.array((1.0, a, b))
+                for m in range(3):
+                    first[m] += at[m] * off
+                    for n in range(3):
+                        second[m, n] += at[m] * at[n]
+                square += off * off
+        count = second[0, 0]
+        aside = np.hypot(second[0, 1], second[0, 2])
+        if count < LEAST_WALL_POINTS or highest > far or aside > OFF_MIDDLE * radius * count:
+            continue
+        if abs(np.linalg.det(second / count)) < (EVEN_ENDS_MM * radius) ** 2:
+            continue  # they are on one line
+        plane = np.linalg.solve(second, first)
+        slope = np.hypot(plane[1], plane[2])
+        if slope > steepest or abs(plane[0]) > band:
+            continue
+        along = most_spread * most_spread * (1.0 + slope * slope)
+        if square - plane @ first <= along * (count - 3.0):
+            out[q] = z[i, j] + plane[0]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def nearest_over(cloud, x, y, i, j, over, under, reach, within):
+    """How far from a place the nearest point between two heights lies, up to `within`."""
+    start, points = cloud
+    ny, nx = start.shape[0], start.shape[1] - 1
+    nearest = within
+    for row in range(max(i - reach, 0), min(i + reach + 1, ny)):
+        for k in range(start[row, max(j - reach, 0)], start[row, min(j + reach + 1, nx)]):
+            if over < points[k, 2] < under:
+                nearest = min(nearest, np.hypot(points[k, 0] - x, points[k, 1] - y))
+    return nearest
+
+
+@njit(cache=True, nogil=True)
+def carved(z, gone, may, seen, broken, origin, cell, over_foot, clear, spacing, least, reach, most):
+    """(ny, nx) heights without what no point lies on, from what is gone inwards, column by column.
+
+    A column beside a lower one that is gone would show a wall, as wide as it is far to the next
+    point that is higher, and half a disc of its top. Where `least` points are expected there, one
+    in `spacing`², and none lies, while broken surface lies within `reach` behind it, it is as low
+    as that one. Nothing goes on through a wall: no point lies `clear` of the lower column. `may`
+    says which columns are asked about; and `most` is how deep it goes, in columns.
+    """
+    ny, nx = z.shape
+    z, gone, within = z.copy(), gone.copy(), reach * cell
+    for _ in range(most):
+        lower = z.copy()
+        for i in range(1, ny - 1):
+            for j in range(1, nx - 1):
+                if not may[i, j]:
+                    continue
+                foot = z[i, j] - over_foot
+                for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                    if not gone[a, b] or z[a, b] >= foot:
+                        continue
+                    x, y = origin[0] + (b + 0.5) * cell, origin[1] + (a + 0.5) * cell
+                    over = z[a, b] + over_foot
+                    if nearest_over(seen, x, y, a, b, over, np.inf, 2, clear) >= clear:
+                        foot = z[a, b]
+                high = z[i, j] - foot - over_foot
+                if high <= 0.0:
+                    continue
+                x, y = origin[0] + (j + 0.5) * cell, origin[1] + (i + 0.5) * cell
+                over = foot + over_foot
+                away = nearest_over(seen, x, y, i, j, over, np.inf, reach, within)
+                if (2.0 * high + 0.5 * np.pi * away) * away < least * spacing * spacing:
+                    continue
+                top = z[i, j] - over_foot
+                if nearest_over(broken, x, y, i, j, over, top, reach, np.inf) <= within:
+                    lower[i, j] = foot
+        went = lower < z
+        if not went.any():
+            break
+        gone |= went
+        z = lower
+    return z

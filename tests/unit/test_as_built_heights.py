@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from amrepair.deficit import compute_deficit
 from amrepair.deficit.heights import _without_fins, as_built_heights, standing_heights
+from amrepair.deficit.walls import as_low_as_seen
 from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import Transform
 from amrepair.scans import Scan
@@ -215,3 +216,52 @@ def test_a_lost_corner_of_a_frame_seen_from_above_is_as_low_as_it_was_seen() -> 
     part = box(0, 0, 0, 30, 20, 6)
     field = field_of(part, box(20, -1, 4, 31, 21, 7), least_up=-2.0)
     assert heights(field, (21.0, 29.0), (1.0, 19.0)).max() < 4.3
+
+
+def test_the_corner_of_a_pit_is_as_low_as_its_floor() -> None:
+    """Solids round it off, three columns high as the walls, and the head stayed out of it."""
+    middle = np.arange(0.05, 4.0, 0.1)
+    x, y = np.meshgrid(middle, middle)
+    pit = (x > 1.5) & (y > 1.5)
+    rounded = pit & (x + y < 3.55)
+    z_mm = np.where(pit & ~rounded, 1.0, 4.0)
+    field = HeightField(np.zeros(2), 0.1, z_mm, np.ones(z_mm.shape, bool))
+    along, up = (v.ravel() for v in np.meshgrid(np.arange(1.5, 4.0, 0.2), np.arange(1.1, 4.0, 0.2)))
+    at = np.full(len(along), 1.5)
+    floor = np.column_stack([x[pit], y[pit], np.full(pit.sum(), 1.0)])[::4]
+    points = np.concatenate([np.column_stack(of) for of in ((along, at, up), (at, along, up))])
+    points = np.concatenate([points, floor])
+    told = as_low_as_seen(field, z_mm < 2.0, points, 0.03, 0.2, np.full(len(points), -1.0))
+    assert (told.z_mm[rounded & (x > 1.6) & (y > 1.6)] == 1.0).all()
+    assert (told.z_mm[~pit] == 4.0).all()
+
+
+def test_the_foot_of_a_slope_is_as_low_as_it_was_seen() -> None:
+    """A worn edge ended a quarter of a millimetre over the bed, and nothing was laid beside it."""
+    side = ((10.0, 0.0), (10.0, 7.0), (15.4, 3.6), (15.4, 7.0))
+    wedge = m3.Manifold.hull_points([(x, y, z) for y in (-1.0, 11.0) for x, z in side])
+    gone = wedge + box(6, -1, -1, 10, 11, 7)
+    field = field_of(box(0, 0, 0, 22, 10, 3.6), gone)
+    x = np.arange(10.3, 15.0, 0.1)
+    off_mm = np.concatenate([
+        field.sample(np.column_stack([x, np.full(len(x), y)])) - (x - 10.0) / 1.5
+        for y in np.arange(2.0, 8.0, 0.5)
+    ])  # fmt: skip
+    assert np.quantile(np.abs(off_mm), 0.98) < 0.1  # of 50 columns one is beside the bed
+
+
+def test_what_shows_no_point_stands_unless_broken_surface_lies_behind_it() -> None:
+    """A scan that missed a wall is no reason to take the wall away."""
+    z_mm = np.full((30, 30), 4.0)
+    z_mm[:, 15:] = 1.0
+    wall = HeightField(np.zeros(2), 0.1, z_mm, np.ones(z_mm.shape, bool))
+    gone = z_mm < 2.0
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(1.5, 3.0, 0.2), np.arange(0.1, 3.0, 0.2)))
+    floor = np.column_stack([x, y, np.full(len(x), 1.0)])
+    told = as_low_as_seen(wall, gone, floor, 0.03, 0.2, np.full(len(floor), -1.0))
+    assert (told.z_mm == z_mm).all()
+    z, y = (v.ravel() for v in np.meshgrid(np.arange(1.1, 4.0, 0.2), np.arange(0.1, 3.0, 0.2)))
+    behind = np.concatenate([floor, np.column_stack([np.full(len(y), 1.25), y, z])])
+    told = as_low_as_seen(wall, gone, behind, 0.03, 0.2, np.full(len(behind), -1.0))
+    assert (told.z_mm[2:-2, 14] == 1.0).all()  # 0.2 mm before what broke
+    assert (told.z_mm[:, :12] == 4.0).all()
