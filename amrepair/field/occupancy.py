@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import ndimage
+from scipy import fft, ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from amrepair.arrays import Mask, Points, VoxelMask
@@ -88,13 +88,16 @@ def find_occupancy(
     return Occupancy(grid.low_mm, grid.voxel_mm, found, grid.f_mm < 0)
 
 
-def _hidden(normals: Points, seen: Mask, options: OccupancyOptions) -> Mask:
-    """Places that nobody saw, where most surface that faces as they do was not seen either."""
+def _hidden(normals: Points, seen: Mask, gone: Mask, options: OccupancyOptions) -> Mask:
+    """Places that nobody saw, where most surface that faces as they do was not seen either.
+
+    What is known to be `gone` counts for neither.
+    """
     ways = spread_directions(FACED_WAYS)
     of = cKDTree(ways).query(normals)[1]
-    every, looked = (np.bincount(of, which, FACED_WAYS) for which in (None, seen))
+    every, looked = (np.bincount(of, which, FACED_WAYS) for which in (~gone, seen & ~gone))
     cover = cover_of(ways, ways, every.astype(np.float64), looked, options)
-    return np.asarray(~seen & (cover[of] < options.hidden_cover))
+    return np.asarray(~seen & ~gone & (cover[of] < options.hidden_cover))
 
 
 def _as_seen(solid: VoxelMask, scan: ScannedSpace, grid: VoxelGrid) -> VoxelMask:
@@ -162,7 +165,8 @@ def _guessed(
     """What is said to be empty, though its end nearest by was not scanned and nobody looked in.
 
     The cheapest labelling ends a void at the smallest surface that closes it: a dent at the rim of
-    a dome that nobody saw would take the dome along.
+    a dome that nobody saw would take the dome along. What an end hides is no deeper than it is
+    wide.
 
     Parameters
     ----------
@@ -205,9 +209,24 @@ def _guessed(
     # past the border of what was scanned of an end both are as near, as far as its points tell it
     guessed[box] &= to_guess < to_known + width_mm / grid.voxel_mm
     if guessed.any():
+        least = np.float32(scan.options.unscanned_share)
+        guessed[box] &= _as_it_looks(guess - least * ends[box]) > 0
+    if guessed.any():
         hull = _hull_of(scan)
         guessed &= ~_looked_into(void, scanned, surface, ways, hull, scan, grid)
     return guessed
+
+
+def _as_it_looks(weight: Float[np.ndarray, "x y z"]) -> Float[np.ndarray, "x y z"]:
+    """Sum of all weights at 1/r³: of a plane's that is their share of what is seen of it.
+
+    For of a plane at a height h an area appears h/r³ large, and h is the same for all.
+    """
+    shape = [fft.next_fast_len(2 * n - 1, real=True) for n in weight.shape]
+    x, y, z = (np.minimum(np.arange(n), n - np.arange(n)).astype(np.float32) ** 2 for n in shape)
+    square = 0.25 + x[:, None, None] + y[:, None] + z  # an end lies half a voxel beyond its middle
+    sums = fft.irfftn(fft.rfftn(weight, shape) * fft.rfftn(square ** np.float32(-1.5)), shape)
+    return np.asarray(sums[tuple(map(slice, weight.shape))])
 
 
 def _is_scanned(end_mm: Points, width_mm: float, scan: ScannedSpace) -> Mask:
@@ -262,10 +281,14 @@ def _looked_into(
     beyond all that was: there the scanner's view may have ended.
     """
     places_mm, normals, seen = surface
-    hidden = _hidden(normals, seen, scan.options)
     within_mm = scan.options.seen_spacings * scan.spacing_mm + grid.voxel_mm
     mouths, looked = {}, np.zeros_like(void)
-    for (axis, way), index, middle_mm in _facets_toward(void, grid.f_mm >= 0, grid):
+    sides = list(_facets_toward(void, grid.f_mm >= 0, grid))
+    gone = np.zeros_like(seen)
+    if not len(ways):  # one view looked its own way, not straight down
+        gone = _seen_through(void, sides, surface, within_mm, scan, grid)
+    hidden = _hidden(normals, seen, gone, scan.options)
+    for (axis, way), index, middle_mm in sides:
         toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
         known = way * feet_on(scan.template, middle_mm)[1][:, axis] > LEAST_FACING
         known &= ~has_near(middle_mm, places_mm[toward], within_mm)
@@ -278,6 +301,27 @@ def _looked_into(
         found = through | scanned[axis, -way]
         looked |= _along(void, known, axis, -way) & _along(void, found, axis, way)
     return looked
+
+
+def _seen_through(
+    void: VoxelMask,
+    sides: list[tuple[tuple[int, int], Int[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]],
+    surface: tuple[Points, Points, Mask],
+    within_mm: float,
+    scan: ScannedSpace,
+    grid: VoxelGrid,
+) -> Mask:
+    """(m,) places straight over broken surface that faces them, a void between: they are gone."""
+    places_mm, normals, seen = surface
+    gone, mouths = np.zeros_like(seen), {side: (index, at_mm) for side, index, at_mm in sides}
+    faced, width_mm = np.abs(scan.broken.plane) > LEAST_FACING, scan.width_mm(grid.voxel_mm)
+    for (axis, way), index, middle_mm in _facets_toward(void, (grid.f_mm < 0) & ~void, grid):
+        told = has_near(middle_mm, scan.broken.place_mm[faced[:, axis]], width_mm)
+        over = _along(void, _marked(void, index[told]), axis, -way)
+        mouth, mouth_mm = mouths[axis, -way]
+        facing = np.flatnonzero(-way * normals[:, axis] > LEAST_FACING)
+        gone[facing] |= has_near(places_mm[facing], mouth_mm[over[tuple(mouth.T)]], within_mm)
+    return gone
 
 
 def _amid(points_mm: Points, hull: Float[np.ndarray, "h 4"], beyond_mm: float) -> Mask:

@@ -87,6 +87,9 @@ class OccupancyOptions:
         Nothing is seen for certain: at most with this probability.
     hidden_cover
         Bare surface is hidden rather than gone if less was seen of what faces the same way.
+    unscanned_share
+        Empty space is a guess where ends that were not scanned take more of the view from there: a
+        disc does so as deep as its radius, 1 − √½.
     deep_extents
         A void is less probable by one nat for so much of its depth, in the template's largest
         extents.
@@ -111,6 +114,7 @@ class OccupancyOptions:
     stray: float = 0.05
     largest_cover: float = 0.999
     hidden_cover: float = 0.5
+    unscanned_share: float = 1.0 - 0.5**0.5
     deep_extents: float = 2.0
     hole_mm: float = 1.0
     margin_mm: float = 1.5

@@ -98,3 +98,31 @@ def test_points_that_stray_to_where_surface_was_hold_nothing_there() -> None:
         scan, MeshSdf.from_mesh(solid_mesh(whole)), build_from_template=PLACED
     )
     assert deficit.missing_mm3 == pytest.approx(gone.volume(), rel=0.01)
+
+
+def test_what_takes_most_of_a_top_along_is_gone_and_not_hidden() -> None:
+    # regression: most surface that faces up was not seen, so what had been of it over the pit
+    # counted as hidden; a patch of wall without points made a guess of all beside it (0.93 found)
+    whole = m3.Manifold.cube((18.0, 14.0, 6.0))
+    gone = whole ^ m3.Manifold.cube((15.4, 11.4, 9.0)).translate((1.3, 1.3, 3.0))
+    points = points_on(whole - gone, each_mm2=0.12)
+    bare = (np.abs(points - (1.3, 7.0, 5.0)) < (0.25, 2.5, 1.9)).all(axis=1)
+    scan = Scan(points[(points[:, 2] > 0.3) & ~bare], 0.04, "template")
+    deficit = compute_deficit(
+        scan, MeshSdf.from_mesh(solid_mesh(whole)), build_from_template=PLACED
+    )
+    assert (deficit.missing ^ gone).volume() > 0.98 * gone.volume()
+
+
+def test_a_patch_without_points_hides_no_more_than_it_is_wide() -> None:
+    # regression: all that lies nearer to it than to scanned surface was a guess (0.95 found)
+    whole = m3.Manifold.cube((20.0, 14.0, 6.0))
+    slope = m3.Manifold.cube((30.0, 30.0, 20.0)).translate((0.0, -5.0, 0.0))
+    gone = whole ^ slope.rotate((0.0, 25.0, 0.0)).translate((6.5, 0.0, 6.0))
+    points = points_on(whole - gone, each_mm2=0.12)
+    bare = (points[:, 2] < 1.5) & (points[:, 0] > 11.0) & (np.abs(points[:, 1] - 7.0) < 1.5)
+    scan = Scan(points[(points[:, 2] > 0.3) & ~bare], 0.04, "template")
+    deficit = compute_deficit(
+        scan, MeshSdf.from_mesh(solid_mesh(whole)), build_from_template=PLACED
+    )
+    assert (deficit.missing ^ gone).volume() > 0.97 * gone.volume()
