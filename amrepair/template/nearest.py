@@ -22,7 +22,7 @@ SORTED, SORT_CELLS, IN_ORDER = 2_000, 64, 0.1
 # No edge of any part runs this way, so that a ray meets none.
 WAY = np.array([0.5389207, 0.7071392, 0.4576831])
 FOLDED = -0.999  # cosine between neighbours' normals: one lies on the other
-THIN = 1e-4  # sine between a triangle's edges
+SLIVER_SINE = 1e-4  # sine between a triangle's edges
 EDGE_ASIDE_RATIO = 1e-6  # of the part's size
 
 
@@ -138,7 +138,7 @@ def _uprights(corners_mm: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"
     one, other = corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     normal = np.cross(one, other)
     long = np.linalg.norm(normal, axis=1)
-    wide = long > THIN * np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    wide = long > SLIVER_SINE * np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
     return np.where(wide[:, None], normal / np.where(wide, long, 1.0)[:, None], 0.0)
 
 

@@ -16,7 +16,7 @@ LEAF = 4  # triangles
 DEEP = 64  # of the stack: halves of any mesh that fits into memory
 TINY_AREA = 1e-300  # of triangles without area
 WITHIN, UPRIGHT_TRIANGLE = 1e-6, 0.99  # of a triangle's weights; the cosine from its normal
-ROUNDING_MM = 1e-6  # of a distance to a plane, and more
+PLANE_SLACK_MM = 1e-6  # of a distance to a plane, and more
 TOGETHER = 256  # points by one thread; each starts from the triangle of the one before
 
 
@@ -119,7 +119,7 @@ def _above(x, y, z, t, size):
 def _plane2(x, y, z, upright, t):
     """Squared distance to a triangle's plane, which none of its points is nearer than."""
     high = upright[0] * (x - t[0, 0]) + upright[1] * (y - t[0, 1]) + upright[2] * (z - t[0, 2])
-    far = max(abs(high) - ROUNDING_MM, 0.0)
+    far = max(abs(high) - PLANE_SLACK_MM, 0.0)
     return far * far
 
 
