@@ -47,6 +47,17 @@ class AnalyticTemplate:
         return self.body
 
 
+def sum_of_waves(
+    places_mm: np.ndarray, waves: np.ndarray, phase: np.ndarray
+) -> Float[np.ndarray, " n"]:
+    """(n,) sums of cosines of the phases that (d, w) `waves` have at (n, d) places.
+
+    In single precision, six digits of each: four times as fast, and noise in all that follows.
+    """
+    at = (places_mm @ waves + phase).astype(np.float32)
+    return np.cos(at).sum(axis=1, dtype=np.float64)
+
+
 def to_trimesh(solid: manifold3d.Manifold) -> trimesh.Trimesh:
     mesh = solid.to_mesh64()
     return trimesh.Trimesh(
@@ -69,7 +80,9 @@ def box_field(low: tuple[float, float, float], high: tuple[float, float, float])
     half = (np.array(high) - np.array(low)) / 2
 
     def f(p: np.ndarray) -> np.ndarray:
-        return _outside_of(np.abs(p.T - centre[:, None]) - half[:, None])
+        over = np.subtract(p.T, centre[:, None], order="C")
+        np.abs(over, out=over)
+        return _outside_of(np.subtract(over, half[:, None], out=over))
 
     return f
 
@@ -79,10 +92,11 @@ def _outside_of(over: np.ndarray) -> np.ndarray:
 
     numpy reduces a short last axis a hundred times as slowly as it adds rows.
     """
-    beyond = np.maximum(over, 0)
-    return np.sqrt(sum(row * row for row in beyond)) + np.minimum(
-        functools.reduce(np.maximum, over), 0
-    )
+    within = np.minimum(functools.reduce(np.maximum, over), 0)
+    beyond = np.maximum(over, 0, out=over)
+    np.multiply(beyond, beyond, out=beyond)
+    found = np.sqrt(functools.reduce(np.add, beyond))
+    return np.add(found, within, out=found)
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> AnalyticTemplate:

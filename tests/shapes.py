@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import functools
 import inspect
-import itertools
 import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from beartype import beartype
 from jaxtyping import jaxtyped
 
 # What is called thousands of times is called from few places: a fifth of some tests was checks.
-ALL_CHECKED = 100
+# From each place so many calls are all checked, and one in so many after them.
+ALL_CHECKED = 5
 checked_every = 16
 
 
@@ -98,14 +98,16 @@ def _asked(function: FunctionType, shapes: dict[str, object]) -> FunctionType:
 
 
 def _checked(function: FunctionType, shapes: dict[str, object]) -> Callable[..., Any]:
-    calls = itertools.count()
+    calls: dict[tuple[CodeType, int], int] = {}
     # not before the first call: most of what a worker loads it never calls
     checking = functools.cache(functools.partial(_asked, function, shapes))
 
     @functools.wraps(function)
     def call(*values: Any, **named: Any) -> Any:
-        call_index = next(calls)
-        if call_index > ALL_CHECKED and call_index % checked_every:
+        caller = sys._getframe(1)
+        place = (caller.f_code, caller.f_lasti)
+        call_index = calls[place] = calls.get(place, -1) + 1
+        if call_index >= ALL_CHECKED and call_index % checked_every:
             return function(*values, **named)
         with jaxtyped("context"):  # one n, one m … for all that this call names
             return checking()(*values, **named)

@@ -170,7 +170,9 @@ def _refine_by_asking(
             iterations += 1
             turned = local @ rotation.T
             f, gradient = template.distance_and_gradient(turned + place)
-            hessians[k], slope = kernels.normal_equations(turned, f, gradient, scale, outside_mm)
+            hessians[k], slope = kernels.normal_equations(
+                turned, f, np.ascontiguousarray(gradient), scale, outside_mm
+            )
             ended, pace, scale = kernels.step(
                 hessians[k], slope, known, first, rotation, place, last, pace, scale, iterations,
                 limits,

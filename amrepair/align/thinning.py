@@ -81,5 +81,5 @@ def order_of(points_mm: Points) -> Numbers:
     """(n,) numbers of the points in an order in which near ones follow each other."""
     low, high = box_of(points_mm)
     edge_mm = max(float((high - low).max()), 1e-9) / (1 << ORDER_BITS)
-    keys = morton_keys(points_mm, low, edge_mm, ORDER_BITS)
+    keys = morton_keys(np.ascontiguousarray(points_mm), low, edge_mm, ORDER_BITS)
     return np.asarray(np.argsort(keys, kind="stable"))

@@ -19,6 +19,7 @@ from amrepair.field.places import PlaceTree
 from amrepair.frames import box_of, cells_of
 from amrepair.observe.views import Shares
 from amrepair.scans import Scan
+from gcode.compiled import read_only
 
 # A grid of so many cells is numbered in place; keys of a larger one are sorted.
 MOST_COUNTED_CELLS = 16_000_000
@@ -120,7 +121,7 @@ class Surfels:
         """What each view contributes to each cell that it saw, ordered by cells."""
         views = int(view_index.max(initial=0)) + 1
         count, total_mm = kernels.sums_by_view(
-            self.of_point, view_index, self.point_deviation_mm, len(self), views
+            self.of_point, view_index, read_only(self.point_deviation_mm), len(self), views
         )
         place, view = np.nonzero(count)
         seen = count[place, view]
@@ -145,7 +146,9 @@ def make_surfels(
     of_point, keys, strides = _numbered(points_mm, keep, box, cell_mm)
     # moments about one origin near the part keep float64 far from cancellation
     origin = box.mean(axis=0)
-    sums = kernels.cell_sums(of_point, points_mm, origin, deviation_mm, len(keys))
+    sums = kernels.cell_sums(
+        of_point, read_only(points_mm), origin, read_only(deviation_mm), len(keys)
+    )
     count, mean_f = sums[:, 11], sums[:, 3] / sums[:, 11]
     table = kernels.neighbour_table(keys, *strides)
     if scan.sensors_mm is not None and scan.sensor_index is not None:
@@ -199,7 +202,7 @@ def _numbered(
     shape = np.floor((box_mm[1] - box_mm[0]) / cell_mm).astype(np.int64) + 3
     strides = (int(shape[1] * shape[2]), int(shape[2]))
     if np.prod(shape.astype(float)) <= MOST_COUNTED_CELLS:
-        return *kernels.numbered(points_mm, keep, box_mm[0], cell_mm, shape), strides
+        return *kernels.numbered(read_only(points_mm), keep, box_mm[0], cell_mm, shape), strides
     index = cells_of(points_mm[keep], box_mm[0], cell_mm) + 1
     of_point = np.full(len(points_mm), -1, np.int64)
     keys, of_point[keep] = np.unique(index @ np.array([*strides, 1]), return_inverse=True)

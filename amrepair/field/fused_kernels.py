@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcode.compiled import njit, prange
+from gcode.compiled import njit
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def neighbour_table(keys, stride_x, stride_y):
     """(s, 27) index of the cell at each offset, −1 where it is empty.
 
@@ -17,7 +17,7 @@ def neighbour_table(keys, stride_x, stride_y):
     """
     n = keys.shape[0]
     table = np.full((n, 27), -1, np.int32)
-    for column in prange(27):
+    for column in range(27):
         dx, dy, dz = column // 9 - 1, column // 3 % 3 - 1, column % 3 - 1
         offset = dx * stride_x + dy * stride_y + dz
         j = 0
@@ -32,12 +32,12 @@ def neighbour_table(keys, stride_x, stride_y):
     return table
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def neighbour_sums(table, values):
     """(s, c) sums of `values` over each cell and its neighbours."""
     n, channels = table.shape[0], values.shape[1]
     out = np.zeros((n, channels))
-    for i in prange(n):
+    for i in range(n):
         for k in range(table.shape[1]):
             j = table[i, k]
             if j >= 0:

@@ -94,13 +94,21 @@ def _in_view(
 def is_free(template: Template, points_mm: Points, toward: Points, options: OneViewOptions) -> Mask:
     """Whether a line from each point leaves the template behind: no step longer than it is far off.
 
-    Each step is as long as nothing of the template is near (sphere tracing, Hart 1996).
+    Each step is as long as nothing of the template is near (sphere tracing, Hart 1996). A line that
+    has left the template's box, and goes on away from it, has left it for good.
     """
     free = np.ones(len(points_mm), bool)
+    low_mm, high_mm = template.bounds_mm
     most_mm = diagonal(template.bounds_mm)
     going, gone_mm = np.arange(len(points_mm)), np.zeros(len(points_mm))
     while len(going):
-        at_mm = points_mm[going] + gone_mm[going, None] * toward[going]
+        way = toward[going]
+        at_mm = points_mm[going] + gone_mm[going, None] * way
+        left = (at_mm < low_mm) & (way <= 0) | (at_mm > high_mm) & (way >= 0)
+        within = ~left.any(axis=1)
+        going, at_mm = going[within], at_mm[within]
+        if not len(going):
+            break
         f_mm = template.distance(at_mm)
         free[going[f_mm < 0]] = False
         gone_mm[going] += np.maximum(f_mm, options.off_mm)

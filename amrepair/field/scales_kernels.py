@@ -154,22 +154,22 @@ def window_statistics(table, count, place, value, weight, rank):
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def window_means(table, count, value):
     """(s,) mean over each window."""
     out = np.zeros(table.shape[0])
-    for i in prange(table.shape[0]):
+    for i in range(table.shape[0]):
         for k in range(count[i]):
             out[i] += value[table[i, k]]
         out[i] /= count[i]
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def window_sums(table, count, value):
     """(s, v) sums over each window of v values a cell."""
     out = np.zeros((table.shape[0], value.shape[1]))
-    for i in prange(table.shape[0]):
+    for i in range(table.shape[0]):
         for k in range(count[i]):
             for c in range(value.shape[1]):
                 out[i, c] += value[table[i, k], c]
@@ -240,11 +240,11 @@ def differences_apart(place, normal, value, group, patch, which, least, most, co
     return off[:n].copy(), worse[:n].copy(), touched
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def window_farthest(table, count, value):
     """(s,) the cell of each window whose value is farthest from zero."""
     out = np.empty(table.shape[0], np.int64)
-    for i in prange(table.shape[0]):
+    for i in range(table.shape[0]):
         most = table[i, 0]
         for k in range(1, count[i]):
             if abs(value[table[i, k]]) > abs(value[most]):

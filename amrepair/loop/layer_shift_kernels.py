@@ -66,17 +66,21 @@ def evidence(place, aside, upper, lower, cut, cell, moves, shares, weights, sigm
     by = (1.0 - stray) / (len(aside) * sigma * ROOT_TWO_PI)
     for i in range(len(place)):
         z = place[i, 2]
+        told_high, told_below, told = np.nan, np.nan, 0.0
         for m in range(len(moves)):
             total = 0.0
             for a in range(len(aside)):
                 x, y = place[i, 0] + aside[a, 0], place[i, 1] + aside[a, 1]
                 high = _height(upper, x - moves[m, 0], y - moves[m, 1], cell)
                 below = _height(lower, x - moves[m, 2], y - moves[m, 3], cell)
-                if high <= max(cut, below):  # nothing of the upper layers: all shares are one
-                    total += _normal(z - below, per_mm)
-                    continue
-                for k in range(len(shares)):
-                    off = z - below - shares[k] * (high - below)
-                    total += weights[k] * _normal(off, per_mm)
+                if high != told_high or below != told_below:  # most tops are flat
+                    told_high, told_below, told = high, below, 0.0
+                    if high <= max(cut, below):  # nothing of the upper layers: all shares are one
+                        told = _normal(z - below, per_mm)
+                    else:
+                        for k in range(len(shares)):
+                            off = z - below - shares[k] * (high - below)
+                            told += weights[k] * _normal(off, per_mm)
+                total += told
             found[m] += np.log(by * total + stray * other)
     return found

@@ -33,7 +33,7 @@ def incidence(normal: Points, to_sensor: Points | None) -> Values:
 def _way_of_one_view(normal: Points) -> Float[np.ndarray, " 3"] | None:
     """(3,) the way that all but a few places face; None where they were seen from more sides."""
     ways = spread_directions(DIRECTIONS)
-    facing = normal[:: len(normal) // FEW_PLACES + 1] @ ways.T
-    least = np.quantile(facing, TURNED_AWAY, axis=0)
+    facing = ways @ normal[:: len(normal) // FEW_PLACES + 1].T
+    least = np.quantile(facing, TURNED_AWAY, axis=1, overwrite_input=True)
     best = int(np.argmax(least))
     return ways[best] if least[best] > 0.0 else None

@@ -16,11 +16,13 @@ from amrepair.template import nearest_kernels as kernels
 from amrepair.template.surface import triangle_areas_normals
 from gcode.compiled import read_only
 
-# A point starts from its neighbour's triangle: many are asked in an order in which they are near.
-SORTED, SORT_CELLS = 20_000, 64
+# A point starts from its neighbour's triangle: many are asked in an order in which they are near,
+# as voxels and most scans come already: from one to the next so much of their extent.
+SORTED, SORT_CELLS, IN_ORDER = 2_000, 64, 0.1
 # No edge of any part runs this way, so that a ray meets none.
 WAY = np.array([0.5389207, 0.7071392, 0.4576831])
 FOLDED = -0.999  # cosine between neighbours' normals: one lies on the other
+SLIVER_SINE = 1e-4  # sine between a triangle's edges
 EDGE_ASIDE_RATIO = 1e-6  # of the part's size
 
 
@@ -62,6 +64,8 @@ class TriangleTree:
         (k,) number of a node's first child, the second follows it; −1 in a leaf.
     first, last
         (k,) its triangles.
+    upright
+        (f, 3) unit normals; zero where a triangle is too thin for one that is right.
     sure
         (f,) whether what lies before a triangle is outside: folds of no thickness, which exports
         leave in the best of meshes, have it the wrong way round.
@@ -74,6 +78,7 @@ class TriangleTree:
     child: Int[np.ndarray, " k"]
     first: Int[np.ndarray, " k"]
     last: Int[np.ndarray, " k"]
+    upright: Float[np.ndarray, "f 3"]
     sure: Bool[np.ndarray, " f"]
 
     @classmethod
@@ -83,7 +88,7 @@ class TriangleTree:
         order, low, high, child, first, last = kernels.build(corners)
         corners = np.ascontiguousarray(corners[order])
         sure = np.ones(len(order), dtype=bool)
-        tree = cls(corners, order, low, high, child, first, last, sure)
+        tree = cls(corners, order, low, high, child, first, last, _uprights(corners), sure)
         _, normals = triangle_areas_normals(vertices_mm, faces[order])
         if not _has_folds(faces[order], normals):
             return tree
@@ -94,8 +99,10 @@ class TriangleTree:
     def nearest(self, points_mm: Points) -> Nearest:
         """What of the triangles is nearest to points."""
         points = read_only(points_mm, np.float64)
-        if len(points) < SORTED:
-            size, which, place, side = kernels.nearest(points, self.sure, *self._numbers)
+        if len(points) < SORTED or _in_order(points):
+            size, which, place, side = kernels.nearest(
+                points, self.sure, self.upright, *self._numbers
+            )
             return Nearest(size, side, self.face[which], place)
         key = np.zeros(len(points), np.int64)
         for along in points.T:
@@ -106,7 +113,7 @@ class TriangleTree:
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         size, which, place, side = kernels.nearest(
-            read_only(points[order]), self.sure, *self._numbers
+            read_only(points[order]), self.sure, self.upright, *self._numbers
         )
         return Nearest(size[back], side[back], self.face[which[back]], place[back])
 
@@ -118,6 +125,21 @@ class TriangleTree:
     @property
     def _numbers(self) -> tuple[np.ndarray, ...]:
         return self.corners_mm, self.low_mm, self.high_mm, self.child, self.first, self.last
+
+
+def _in_order(points_mm: Points) -> bool:
+    """Whether points that follow each other are near each other."""
+    step_mm = np.abs(np.diff(points_mm, axis=0)).mean(axis=0)
+    return bool(step_mm.sum() < IN_ORDER * np.ptp(points_mm, axis=0).sum())
+
+
+def _uprights(corners_mm: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:
+    """(f, 3) unit normals, zero where rounding has a part in them."""
+    one, other = corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
+    normal = np.cross(one, other)
+    long = np.linalg.norm(normal, axis=1)
+    wide = long > SLIVER_SINE * np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    return np.where(wide[:, None], normal / np.where(wide, long, 1.0)[:, None], 0.0)
 
 
 def _has_folds(faces: Faces, normals: Float[np.ndarray, "f 3"]) -> bool:

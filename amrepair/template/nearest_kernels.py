@@ -16,6 +16,7 @@ LEAF = 4  # triangles
 DEEP = 64  # of the stack: halves of any mesh that fits into memory
 TINY_AREA = 1e-300  # of triangles without area
 WITHIN, UPRIGHT_TRIANGLE = 1e-6, 0.99  # of a triangle's weights; the cosine from its normal
+PLANE_SLACK_MM = 1e-6  # of a distance to a plane, and more
 TOGETHER = 256  # points by one thread; each starts from the triangle of the one before
 
 
@@ -114,8 +115,16 @@ def _above(x, y, z, t, size):
     return 1 if high > 0.0 else -1
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _plane2(x, y, z, upright, t):
+    """Squared distance to a triangle's plane, which none of its points is nearer than."""
+    high = upright[0] * (x - t[0, 0]) + upright[1] * (y - t[0, 1]) + upright[2] * (z - t[0, 2])
+    far = max(abs(high) - PLANE_SLACK_MM, 0.0)
+    return far * far
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def nearest(points, sure, corners, low, high, child, first, last):
+def nearest(points, sure, upright, corners, low, high, child, first, last):
     """(n,) distance, (n,) number of the nearest triangle in the tree's order, (n, 3) its point.
 
     And (n,) −1 inside, 1 outside where that point is within the triangle; 0 on an edge or a corner.
@@ -137,6 +146,8 @@ def nearest(points, sure, corners, low, high, child, first, last):
                 k = stack[top]
                 if child[k] < 0:
                     for t in range(first[k], last[k]):
+                        if _plane2(x, y, z, upright[t], corners[t]) >= best2:
+                            continue
                         here2, a, b = _on_triangle(x, y, z, corners[t])
                         if here2 < best2:
                             best2, best, s, w = here2, t, a, b

@@ -26,6 +26,7 @@ from amrepair.arrays import Points, Values, Vector
 from amrepair.errors import InputError
 from amrepair.frames import grid_points, unit_vectors
 from amrepair.template.grid import Grid, GridSdf
+from amrepair.template.grid_kernels import shared_nodes
 from amrepair.template.learned import TOLERATED_SPREADS, LearnedSdf, Tolerance
 
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
@@ -272,17 +273,21 @@ def _inverse_trigamma(y: float) -> float:
 
 
 def _on_top(template: GridSdf, sound: SoundParts, options: SoundOptions) -> LearnedSdf:
-    """The field with the offset taken from it, its mesh moved out by it, and the tolerance."""
+    """The field with the offset taken from it, its mesh moved out by it, and the tolerance.
+
+    Nodes that blocks share are asked once.
+    """
     grid = template.grid
     axes = [grid.origin_mm[k] + grid.cell_mm * np.arange(n) for k, n in enumerate(grid.base.shape)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     base = _lowered(grid.base, nodes, template, sound, options)
-    fine = np.linspace(0.0, grid.cell_mm, grid.blocks.shape[1])
-    inner = np.stack(np.meshgrid(fine, fine, fine, indexing="ij"), axis=-1)
-    corners = grid.origin_mm + grid.cell_mm * grid.cells
-    blocks = _lowered(
-        grid.blocks, corners[:, None, None, None, :] + inner[None], template, sound, options
-    )
+    fine = grid.blocks.shape[1] - 1
+    back, first = shared_nodes(grid.cells, grid.block_of.astype(np.int64), fine)
+    block, own = np.divmod(first, (fine + 1) ** 3)
+    inner = grid_points(*[np.arange(fine + 1)] * 3)
+    where = grid.origin_mm + (grid.cells[block] * fine + inner[own]) * (grid.cell_mm / fine)
+    lowered = _lowered(grid.blocks.reshape(-1)[first], where, template, sound, options)
+    blocks = np.ascontiguousarray(lowered[back].reshape(grid.blocks.shape))
     moved = template.mesh.copy()
     vertices = np.asarray(template.mesh.vertices, dtype=np.float64)
     f_mm, gradient = template.distance_and_gradient(vertices)

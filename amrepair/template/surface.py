@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from amrepair.arrays import Faces, Vertices
 from amrepair.template import surface_kernels as kernels
+from gcode.compiled import read_only
 
 if TYPE_CHECKING:
     import trimesh
@@ -50,7 +51,7 @@ def sample_surface(
 
 def _for_kernels(vertices_mm: Vertices, faces: Faces) -> tuple[Vertices, Faces]:
     """The same in one type, so that each kernel is compiled once."""
-    return np.ascontiguousarray(vertices_mm, np.float64), np.ascontiguousarray(faces, np.int64)
+    return read_only(vertices_mm, np.float64), read_only(faces, np.int64)
 
 
 def count_for_spacing(areas_mm2: Float[np.ndarray, " f"], spacing_mm: float) -> int:

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcode.compiled import njit, prange
+from gcode.compiled import njit
 
 LEAST_NORMAL = 1e-300  # of a triangle with an area
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def areas_normals(vertices, faces):
     """(f,) areas and (f, 3) unit normals (zero where a triangle has no area)."""
     areas, normals = np.empty(len(faces)), np.empty((len(faces), 3))
-    for i in prange(len(faces)):
+    for i in range(len(faces)):
         a, b, c = faces[i, 0], faces[i, 1], faces[i, 2]
         ux, vx = vertices[b, 0] - vertices[a, 0], vertices[c, 0] - vertices[a, 0]
         uy, vy = vertices[b, 1] - vertices[a, 1], vertices[c, 1] - vertices[a, 1]

@@ -100,6 +100,7 @@ class _Taken:
     def add(self, block: Block) -> None:
         """The next one."""
         steps, pushed, feed = block.moves()
+        pushed = np.ascontiguousarray(pushed)
         kernels.limits(
             steps, pushed, feed, *self._limits, self._before, self._planned, block.first_line
         )

@@ -11,7 +11,7 @@ from amrepair.regions.error_calibration import NORMAL_BY_BED, NORMAL_NOISE
 from amrepair.regions.observation import observed
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
-from tests.analytic import box, cylinder, difference, sample_surface
+from tests.analytic import box, cylinder, difference, sample_surface, sum_of_waves
 from tests.draws import draws
 
 SIGMA_MM = 0.05
@@ -203,7 +203,7 @@ def wavering(points_mm: np.ndarray, sigma_mm: float, length_mm: float, seed: int
     rng = np.random.default_rng(seed)
     ways = rng.normal(0.0, 1.0 / length_mm, (200, 3))
     phase = rng.uniform(0.0, 2.0 * np.pi, 200)
-    return sigma_mm * np.sqrt(2.0 / 200.0) * np.cos(points_mm @ ways.T + phase).sum(axis=1)
+    return sigma_mm * np.sqrt(2.0 / 200.0) * sum_of_waves(points_mm, ways.T, phase)
 
 
 @pytest.mark.parametrize("seed", range(2))

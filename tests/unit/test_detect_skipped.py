@@ -288,7 +288,7 @@ def erring(solid: m3.Manifold, seed: int, sigma_mm: float, over_mm: float) -> Sc
     for view in range(len(ASLANT)):
         mine = scan.sensor_index == view
         ways, phase = rng.normal(0.0, 1.0 / over_mm, (200, 2)), rng.uniform(0.0, 2 * np.pi, 200)
-        waves = np.cos(points_mm[mine, :2] @ ways.T + phase).sum(axis=1)
+        waves = analytic.sum_of_waves(points_mm[mine, :2], ways.T, phase)
         points_mm[mine, 2] += sigma_mm * np.sqrt(2.0 / 200.0) * waves
     return Scan(points_mm, 0.05, "template", None, ASLANT.copy(), scan.sensor_index)
 

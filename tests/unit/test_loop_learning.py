@@ -121,7 +121,7 @@ def test_where_the_bed_tells_long_tails_each_look_is_judged_by_it(
     def with_bed(request: ScanRequest) -> Scan:
         """Patches of 1.5 mm of the bed lie up to a millimetre too low."""
         seen = sound(request)
-        xy = rng.uniform(-8.0, 24.0, (20_000, 2))
+        xy = rng.uniform(-8.0, 24.0, (10_000, 2))
         low = rng.exponential(0.25, (22, 22)) * (rng.random((22, 22)) < 0.1)
         cell = ((xy + 8.0) / 1.5).astype(int)
         z = rng.normal(0.0, 0.02, len(xy)) - low[tuple(cell.T)]

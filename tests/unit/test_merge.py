@@ -59,14 +59,15 @@ def placed(points: np.ndarray, seed: int) -> Scan:
     return Scan(points @ turn.T + shift, 0.04, "scanner", source=f"scan{seed}")
 
 
-def joined(clouds: list[np.ndarray]) -> Cloud:
-    """Scans that stand in one frame already."""
+def joined(clouds: list[np.ndarray], part: AnalyticTemplate) -> Cloud:
+    """Scans that stand in one frame already, and face as the part does: what tells is not fused."""
     spacing = [spacing_of(c) for c in clouds]
     normals = np.concatenate([planes(c, s).normals for c, s in zip(clouds, spacing, strict=True)])
     points = np.concatenate(clouds)
     together = spacing_of(points)
     scan = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-    facing = outward(points, normals, together, SIGMA_MM)
+    truth = part.distance_and_gradient(points)[1]
+    facing = np.where((normals * truth).sum(axis=1, keepdims=True) < 0.0, -normals, normals)
     return Cloud(points, facing, scan, len(clouds), together, SIGMA_MM, max(spacing))
 
 
@@ -124,7 +125,7 @@ def test_a_hollow_that_one_scan_alone_saw_into_is_kept() -> None:
         floor = (abs(points - (20, 15, 4)) < (9.9, 6.9, 0.5)).all(axis=1)
         shelf = (points[:, 2] > 3.0) & (points[:, 2] < 11.0) & floor
         clouds.append(points if seed == 0 else points[~shelf])
-    assert fuse(joined(clouds)).rejected < 20
+    assert fuse(joined(clouds, step)).rejected < 20
 
 
 @pytest.mark.slow
@@ -167,7 +168,7 @@ def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
     clouds[2][near & (clouds[2][:, 2] > 7.5), 2] += 1.5  # a bulge
     rim = np.linalg.norm(clouds[3] - (34, 3, 8), axis=1) < 3.0
     clouds[3][rim & (clouds[3][:, 2] > 7.5), 2] -= 0.15  # a dent, within reach of the fit
-    fused = fuse(joined(clouds))
+    fused = fuse(joined(clouds, part))
     assert fused.rejected > 100
     error_mm = fused_error(fused, part)
     assert np.quantile(error_mm, 0.999) < 0.2
@@ -183,7 +184,7 @@ def test_where_normal_parts_differ_the_spread_says_so(part: AnalyticTemplate) ->
     for cloud, lift in zip(clouds, (-0.15, -0.05, 0.05, 0.15), strict=True):
         top = (np.linalg.norm(cloud[:, :2] - (30, 15), axis=1) < 5.5) & (cloud[:, 2] > 17.5)
         cloud[top, 2] += lift
-    fused = fuse(joined(clouds))
+    fused = fuse(joined(clouds, part))
     assert fused.spread is not None
     truth_mm = float(np.std((-0.15, -0.05, 0.05, 0.15), ddof=1))
     middle = np.array([[30.0, 15.0, 18.0]])
@@ -213,7 +214,7 @@ def test_what_no_scan_saw_is_closed_and_said(part: AnalyticTemplate) -> None:
     for s in range(2):
         cloud = points_of(part, 30_000, s)
         clouds.append(cloud[cloud[:, 2] > 1.0])  # stands on a table
-    fused = fuse(joined(clouds))
+    fused = fuse(joined(clouds, part))
     assert fused.mesh.is_volume
     assert fused.unseen_ratio > 0.2
     top = np.array([[20.0, 5.0, 8.0], [30.0, 15.0, 18.0]])

@@ -30,7 +30,7 @@ def correlated_noise(place_mm: np.ndarray, rng: np.random.Generator) -> np.ndarr
     """White noise and a smooth field whose correlation falls over CORRELATION_MM."""
     waves = rng.normal(0, 1 / CORRELATION_MM, (3, 400))
     phase = rng.uniform(0, 2 * np.pi, 400)
-    smooth = np.cos(place_mm @ waves + phase).sum(axis=1) * np.sqrt(2 / 400)
+    smooth = analytic.sum_of_waves(place_mm, waves, phase) * np.sqrt(2 / 400)
     return NOISE_MM * (smooth + rng.normal(0, 1, len(place_mm)))
 
 

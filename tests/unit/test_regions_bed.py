@@ -11,6 +11,7 @@ from amrepair.regions.bed import by_beds, of_bed
 from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_BY_BED, Calibration
 from amrepair.regions.options import RegionOptions
 from amrepair.scans import Scan
+from tests.analytic import sum_of_waves
 
 PART_MM = np.array([[0.0, 0.0, 0.0], [30.0, 20.0, 8.0]])
 TOLERANCE_MM = 0.16
@@ -98,7 +99,7 @@ def test_what_lies_on_the_bed_is_no_error_of_the_scanners() -> None:
 def test_errors_that_hang_together_are_told_by_how_far_windows_wander() -> None:
     points = bed(0)
     ways = np.random.default_rng(3).normal(0.0, 1.0 / 4.0, (200, 2))
-    waves = np.cos(points[:, :2] @ ways.T + np.arange(200.0)).sum(axis=1)
+    waves = sum_of_waves(points[:, :2], ways.T, np.arange(200.0))
     points[:, 2] += 0.12 * np.sqrt(2.0 / 200.0) * waves
     found = told(points)
     assert found is not None
