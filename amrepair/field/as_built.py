@@ -15,6 +15,7 @@ from jaxtyping import Bool
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.faces import Faces, SurfacePlanes, find_faces
 from amrepair.field.fused import Surfels
+from amrepair.field.groups import group_points
 from amrepair.field.near import has_near
 from amrepair.field.options import EvidenceOptions
 from amrepair.frames import unit_vectors
@@ -190,7 +191,7 @@ def gather(
     faces, unmet = None, None
     if len(which):
         surface = template.surface_points(max(options.patch_mm, surfels.spacing_mm))
-        if not images or _is_open(surface, surfels, images, options):
+        if not images or _is_open(surface, surfels, off, images, options):
             faces = find_faces(
                 scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=options
             )
@@ -210,14 +211,21 @@ def gather(
 def _is_open(
     surface: tuple[Points, Points],
     surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
     images: tuple[RangeImage, ...],
     options: EvidenceOptions,
 ) -> bool:
-    """Whether sensors looked at surface that no point lies on, and no ray tells where it went."""
+    """Whether sensors looked at surface that nothing tells of, which begins at broken surface.
+
+    No point lies on it, and no ray that ended passed it.
+    """
     places_mm, normals = surface
     bare = ~has_near(places_mm, surfels.place_mm, options.stub_cells * surfels.cell_mm)
     places_mm, normals = places_mm[bare], normals[bare]
+    together = np.concatenate([places_mm, surfels.place_mm[off]])
+    group = group_points(together, reach_mm=(options.stub_cells + 1.0) * surfels.cell_mm)
     quiet = clearances(images, places_mm, SOLID_MM)[1] <= 0.0
+    quiet &= np.isin(group[: len(places_mm)], group[len(places_mm) :])
     places_mm, normals = places_mm[quiet], normals[quiet]
     looked = np.zeros(len(places_mm), bool)
     for image in images:
