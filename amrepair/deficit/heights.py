@@ -3,7 +3,8 @@
 The slicer lays beads onto it, and the checker keeps the head clear of it. A height is a robust mean
 of the topmost points in a column. A column that no ray reached counts as solid up to the printed
 height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points, the
-part is taken to stand as designed, with that margin, and nothing where it was designed open.
+part is taken to stand as designed, with that margin, and nothing where it was designed open. So it
+is beside a part to which somebody has cut its scan, sensors or not.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import DEFAULT_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
-from amrepair.frames import Transform, box_corners
+from amrepair.frames import Transform, box_corners, box_of
 from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -64,14 +65,16 @@ def as_built_heights(
     solid_z = np.full(grid.shape, top_z + options.unseen_margin_mm)
     z, seen = _tops(points, grid, options)
     known = seen
-    if scan.sensors_mm is None:
+    cut = scan.sensors_mm is not None and _is_cut_to(box, grid, seen, options)
+    if scan.sensors_mm is None or cut:
         placed = build_from_template.solid(template.solid())
         designed_z = HeightField.from_manifold(placed, cell_mm, box_mm=grid.box_mm).z_mm
         designed_z = designed_z[:ny, :nx].astype(np.float64)
         bare = ~seen & (designed_z <= 0)
         z = np.where(bare, 0.0, z)
         known = seen | bare
-        solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
+        if not cut:
+            solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
     z, closed = _close_gaps(z, known, cell_mm, options)
     seen = seen | (closed & ~known)
     known = closed
@@ -79,6 +82,19 @@ def as_built_heights(
         solid = replace(grid, z_mm=solid_z, seen=known)
         solid_z = _crossed(solid, float(low[2]), build_from_template.inverse(), images, options)
     return replace(grid, z_mm=np.where(known, np.maximum(z, 0.0), solid_z), seen=seen)
+
+
+def _is_cut_to(
+    corners: Points, grid: HeightField, seen: ColumnMask, options: HeightOptions
+) -> bool:
+    """Whether a scan holds nothing beside the part in that box, no bed either: it was cut to it."""
+    low, high = box_of(corners)[:, :2]
+    x, y = grid.centres_mm()
+    beside = options.cut_beside_mm
+    off_x = (x < low[0] - beside) | (x > high[0] + beside)
+    off_y = (y < low[1] - beside) | (y > high[1] + beside)
+    off = off_y[:, None] | off_x[None, :]
+    return bool(seen[off].sum() <= options.cut_strays * off.sum())
 
 
 def _crossed(

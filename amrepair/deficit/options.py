@@ -88,6 +88,9 @@ class HeightOptions:
         points would have been seen; and so few columns without a point are chance.
     most_steps_down
         In how many steps, at most, unseen columns are lowered along rays.
+    cut_beside_mm, cut_strays
+        A scan was cut to its part if of the columns so far beside it and farther no more than this
+        share hold a point: strays.
     off_sigma
         A point stands out if it lies this many standard deviations of the scan's noise above all
         surface that is as near to it, seen from above. With 2 one in fifty of the thousands of
@@ -116,6 +119,8 @@ class HeightOptions:
     unseen_fin_cells: int = 8
     chance_cells: int = 5
     most_steps_down: int = 64
+    cut_beside_mm: float = 1.0
+    cut_strays: float = 0.01
     off_sigma: float = 3.5
     crest_sigma: float = 2.0
     others_near: int = 2

@@ -1,7 +1,8 @@
 """Evidence: whether a scan shows a point in space to be empty or solid, and by how much.
 
-Rays decide where sensors are known; elsewhere the nearest scanned surface does. Where neither tells
-anything the answer is "solid", so that unseen is never called missing.
+Rays decide where sensors are known; elsewhere the nearest scanned surface does, and so where a
+sensor looked and no ray ended: scans seldom hold the bed. Where neither tells anything the answer
+is "solid", so that unseen is never called missing.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from jaxtyping import Bool
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field.faces import Faces, SurfacePlanes, find_faces
 from amrepair.field.fused import Surfels
+from amrepair.field.groups import group_points
 from amrepair.field.near import has_near
 from amrepair.field.options import EvidenceOptions
 from amrepair.frames import unit_vectors
 from amrepair.observe.rays import RangeImage, clearances
+from amrepair.observe.unmet import UnmetRays
 from amrepair.scans import Scan
 from amrepair.template.port import Template
 
@@ -44,7 +47,9 @@ class Evidence:
         The options it was gathered with.
     faces
         The scanned faces around defects, which decide where there are no rays; None where there
-        are rays, or no defect.
+        is no defect, or rays ended wherever a sensor looked.
+    unmet
+        Rays that met nothing, where there are such and `faces` are asked about them.
     """
 
     surfels: Surfels
@@ -53,6 +58,7 @@ class Evidence:
     images: tuple[RangeImage, ...]
     options: EvidenceOptions
     faces: Faces | None = None
+    unmet: UnmetRays | None = None
 
     @property
     def spacing_mm(self) -> float:
@@ -76,13 +82,35 @@ class Evidence:
             near = self._by_surface(points_mm, f_mm, most_mm)
             return near, near
         best, least = clearances(self.images, points_mm, SOLID_MM)
-        return self._sharpened(points_mm, f_mm, best), least
+        best = self._sharpened(points_mm, f_mm, best)
+        if self.unmet is None:
+            return best, least
+        told = self._left_through(points_mm, f_mm, least, most_mm)
+        return np.maximum(best, told), np.maximum(least, told)
 
     def cautious(self, points_mm: Points, f_mm: Values, most_mm: float = np.inf) -> Values:
         """The cautious estimate of `clearance` alone, which is cheaper."""
         if not self.has_rays:
             return self._by_surface(points_mm, f_mm, most_mm)
-        return clearances(self.images, points_mm, SOLID_MM)[1]
+        least = clearances(self.images, points_mm, SOLID_MM)[1]
+        if self.unmet is None:
+            return least
+        return np.maximum(least, self._left_through(points_mm, f_mm, least, most_mm))
+
+    def _left_through(
+        self, points_mm: Points, f_mm: Values, least_mm: Values, most_mm: float
+    ) -> Values:
+        """The clearance by faces of what no ray crossed that ended, but some that met nothing.
+
+        Of all else nothing is said.
+        """
+        assert self.faces is not None
+        assert self.unmet is not None
+        told = np.full(len(points_mm), SOLID_MM)
+        ask = np.flatnonzero((least_mm <= 0.0) & (f_mm < 0.0))
+        ask = ask[self.unmet.left_through(points_mm[ask])]
+        told[ask] = self.faces.clearance(points_mm[ask], f_mm[ask], most_mm)
+        return told
 
     def rays_say(self, points_mm: Points) -> Values:
         """The best estimate of `clearance` by rays alone; cheap, and noisy by a pixel."""
@@ -119,7 +147,7 @@ class Evidence:
         NaN where none lies over or under the point.
         """
         options, planes, spacing_mm = self.options.faces, self._planes, self.surfels.cell_mm
-        if self.faces is not None:
+        if self.faces is not None and not self.has_rays:
             planes, spacing_mm = self.faces.planes, self.faces.spacing_mm
         if not planes.off.any():
             return np.full(len(points_mm), np.nan)
@@ -160,19 +188,50 @@ def gather(
         off |= _seen_from_within(template, surfels, off, options)
     normal = np.zeros((len(surfels), 3))
     which = np.flatnonzero(off)
-    faces = None
+    faces, unmet = None, None
+    if len(which):
+        surface = template.surface_points(max(options.patch_mm, surfels.spacing_mm))
+        if not images or _is_open(surface, surfels, off, images, options):
+            faces = find_faces(
+                scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=options
+            )
+            if images:
+                stands_mm = np.concatenate([faces.occupancy.standing_mm, surfels.place_mm])
+                unmet = UnmetRays.of(images, stands_mm, faces.occupancy.voxel_mm)
     facing = surfels.toward_sensors(which)
     if facing is not None:
         normal[which] = _toward(surfels.planes(which), facing)
         surfels = surfels.halves_joined(which, normal[which])
-    elif len(which):
-        surface = template.surface_points(max(options.patch_mm, surfels.spacing_mm))
-        faces = find_faces(
-            scan, template, surfels, off, surface, threshold_mm=threshold_mm, options=options
-        )
+    elif faces is not None:
         nearest = faces.planes.tree.nearest_one(surfels.place_mm[which])
         normal[which] = _toward(surfels.planes(which), faces.planes.normal[nearest])
-    return Evidence(surfels, off, normal, images, options, faces)
+    return Evidence(surfels, off, normal, images, options, faces, unmet)
+
+
+def _is_open(
+    surface: tuple[Points, Points],
+    surfels: Surfels,
+    off: Bool[np.ndarray, " s"],
+    images: tuple[RangeImage, ...],
+    options: EvidenceOptions,
+) -> bool:
+    """Whether sensors looked at surface that nothing tells of, which begins at broken surface.
+
+    No point lies on it, and no ray that ended passed it.
+    """
+    places_mm, normals = surface
+    bare = ~has_near(places_mm, surfels.place_mm, options.stub_cells * surfels.cell_mm)
+    places_mm, normals = places_mm[bare], normals[bare]
+    together = np.concatenate([places_mm, surfels.place_mm[off]])
+    group = group_points(together, reach_mm=(options.stub_cells + 1.0) * surfels.cell_mm)
+    quiet = clearances(images, places_mm, SOLID_MM)[1] <= 0.0
+    quiet &= np.isin(group[: len(places_mm)], group[len(places_mm) :])
+    places_mm, normals = places_mm[quiet], normals[quiet]
+    looked = np.zeros(len(places_mm), bool)
+    for image in images:
+        facing = ((image.sensor_mm - places_mm) * normals).sum(axis=1) > 0.0
+        looked |= facing & UnmetRays.of((image,), places_mm[:0], 0.0).left_through(places_mm)
+    return bool(looked.sum() > options.faces.plane_points)
 
 
 def with_stubs(evidence: Evidence, gone_mm: Points, labelled: Bool[np.ndarray, " s"]) -> Evidence:

@@ -71,6 +71,11 @@ class Occupancy:
             said[thin] = self._told[tuple(self._near_designed(points_mm[thin]).T)]
         return said
 
+    @property
+    def standing_mm(self) -> Points:
+        """(n, 3) middles of voxels that are solid, and should be."""
+        return self.low_mm + (np.argwhere(self.solid & self.designed) + 0.5) * self.voxel_mm
+
     def _near_designed(self, points_mm: Points) -> Int[np.ndarray, "n 3"]:
         """Designed voxels nearest to points: of a sheet that is thinner none holds a middle."""
         every, tree = self._designed_voxels

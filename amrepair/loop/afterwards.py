@@ -38,7 +38,8 @@ class Afterwards:
     ways
         None where that is too little to ask about (`PolicyOptions.buried_mm3`).
     not_again
-        Why the job cannot be printed again from a layer on; empty where it can, or nobody asks.
+        Why the job cannot be printed again from a layer on; empty where it can, or where it prints
+        the part and nobody asks.
     covered
         Which layers lack plastic under later ones, in words; empty where none are told.
     """
@@ -77,19 +78,30 @@ def afterwards(
     if aside is not None and aside.layer is not None and stands:
         again = printed_again(aside.layer, job, end, setup, command=command)
         return Afterwards(0.0, (again,), "", f"{aside.told}; no patch mends that")
-    plan = with_covered(plan, job, template, end)
+    other = _of_another_part(job, template, setup)
+    if not other:  # walls and beads of another part say nothing of this one's
+        plan = with_covered(plan, job, template, end)
     left = buried(pieces_of(plan, ()), end, plan.layer_height_mm, plan.policy)
     open_mm3 = buried_mm3(left)
     if open_mm3 < plan.policy.buried_mm3:
-        return Afterwards(open_mm3)
+        return Afterwards(open_mm3, not_again=other)
     offered = ways(left, job, end, setup, command=command)
     not_again = "it begins in the first layer, and nothing would stand there"
-    if len(offered) > 1:
-        not_again = _why_not_again(job, template, plan.build_from_template, setup)
+    if other or len(offered) > 1:
+        not_again = other or _why_not_again(job, template, plan.build_from_template, setup)
     if not_again:
         offered = tuple(way for way in offered if way.layer is None)
     covered = "" if plan.covered is None else plan.covered.told
     return Afterwards(open_mm3, offered, not_again, covered)
+
+
+def _of_another_part(job: Job, template: Template, setup: PrintSetup) -> str:
+    """Why a job is none of the part; empty where it prints it."""
+    try:
+        locate_parts(job, template, layer_height_mm=setup.process.layer_height_mm)
+    except AlignmentError as error:
+        return f"{error}; of this job only the heights of its layers were taken"
+    return ""
 
 
 def _why_not_again(job: Job, template: Template, placed: Transform, setup: PrintSetup) -> str:

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import stdtrit
 
-from amrepair.arrays import Points, Values
-from amrepair.frames import unit_vectors
+from amrepair.arrays import Mask, Points, Values
+from amrepair.frames import in_box, unit_vectors
 from amrepair.loop.looks import Look, Stop
 from amrepair.observe.robust import sigma_by_median
 from amrepair.regions import Label
@@ -66,6 +66,9 @@ class ThinLayersOptions:
         Steepness of a wall.
     near_mm
         What lies farther off is no bead that is thin.
+    hole_mm
+        A thin bead's wall stands in by half its width at most. What is deeper than a whole one is a
+        hole, whose floor lies inside of the walls around it.
     most_points
         That are looked at.
     """
@@ -85,6 +88,7 @@ class ThinLayersOptions:
     least_patches: int = 8
     wall_cosine: float = 0.4
     near_mm: float = 1.0
+    hole_mm: float = 0.45
     most_points: int = 40_000
 
 
@@ -140,9 +144,11 @@ def with_covered(
     open_mm3 = thin.lacking * beads.volume_mm3 - _seen_mm3(plan, low_mm)
     filled = [look for look in before if look.printed and look.stop.z_mm > low_mm]
     open_mm3 -= sum(look.plan.patch.reachable_mm3 for look in filled if look.plan.patch is not None)
+    if open_mm3 <= 0.0:
+        return plan
     ends_mm = np.concatenate([beads.start_mm, beads.end_mm])
     (x0, y0, _), (x1, y1, z1) = ends_mm.min(axis=0).tolist(), ends_mm.max(axis=0).tolist()
-    piece = PatchRegion(max(open_mm3, 0.0), (x0, y0, low_mm, x1, y1, z1), 0.0)
+    piece = PatchRegion(open_mm3, (x0, y0, low_mm, x1, y1, z1), 0.0)
     return replace(plan, covered=CoveredLayers(first, thin.last, thin.lacking, piece))
 
 
@@ -160,13 +166,30 @@ def _seen_mm3(plan: RepairPlan, low_mm: float) -> float:
 def _on_part(
     plan: RepairPlan, expected: Template, options: ThinLayersOptions
 ) -> tuple[Points, Values, Points]:
-    """Points of the scan near the part, build frame; how far out they lie; which way is out."""
+    """Points of the scan near the part, build frame; how far out they lie; which way is out.
+
+    None of where more than a bead is gone: a hole's floor lies inside of the part's walls, too.
+    """
     points_mm, deviation_mm = plan.anomaly.points_mm, plan.anomaly.deviation_mm
     near = np.flatnonzero(np.abs(deviation_mm) < options.near_mm)
     near = near[:: max(1, -(-len(near) // options.most_points))]
-    placed, points_mm = plan.build_from_template, points_mm[near]
-    outward = placed.rotate(unit_vectors(expected.distance_and_gradient(points_mm)[1]))
-    return placed.apply(points_mm), deviation_mm[near], outward
+    placed = plan.build_from_template
+    place_mm = placed.apply(points_mm[near])
+    wall = ~_by_holes(plan, place_mm, options)
+    near, place_mm = near[wall], place_mm[wall]
+    outward = placed.rotate(unit_vectors(expected.distance_and_gradient(points_mm[near])[1]))
+    return place_mm, deviation_mm[near], outward
+
+
+def _by_holes(plan: RepairPlan, place_mm: Points, options: ThinLayersOptions) -> Mask:
+    """(n,) which places are in the box of a hole, or beside it by no more than is tolerated."""
+    beside_mm = plan.deficit.tolerance_mm
+    within = np.zeros(len(place_mm), dtype=bool)
+    for region in plan.deficit.regions:
+        if region.label is Label.MISSING and region.depth_mm > options.hole_mm:
+            low, high = region.box_mm
+            within |= in_box(place_mm, low - beside_mm, high + beside_mm)
+    return within
 
 
 def thin_layers(

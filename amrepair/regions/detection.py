@@ -289,8 +289,8 @@ def _label_surface(seen: Observed, evidence: Evidence, test: Tested) -> Numbers:
     label = np.where(present, int(Label.OK), int(Label.UNSEEN))
     if evidence.has_rays:
         label[test.gone] = int(Label.MISSING)
-    elif missing.any():
-        open_ = np.flatnonzero(~present)
+    if missing.any() and (evidence.unmet is not None or not evidence.has_rays):
+        open_ = np.flatnonzero(label == Label.UNSEEN)
         # just inside the surface, as deep as the limit: empty there is more than noise
         inside = surface_mm[open_] - limit_mm * seen.normals[open_]
         f_mm = seen.template.distance(inside)

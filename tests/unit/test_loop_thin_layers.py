@@ -12,10 +12,12 @@ from amrepair.loop import Stop
 from amrepair.loop.afterwards import afterwards
 from amrepair.loop.looks import Look, left_well
 from amrepair.loop.sites import sites
-from amrepair.loop.thin_layers import thin_layers, with_covered
+from amrepair.loop.thin_layers import DEFAULT_THIN, _on_part, thin_layers, with_covered
 from amrepair.policy import Action
+from amrepair.regions import DefectType, Label, Region
 from amrepair.repair import RepairPlan
-from tests.unit.loop_bench import PLACE_MM, SIZE_MM, Small, scan_of
+from amrepair.template import MeshSdf
+from tests.unit.loop_bench import PLACE_MM, SIZE_MM, Small, scan_of, solid_mesh
 
 THIN, LAST = range(8, 11), 14
 WIDTH_MM, LAYER_MM = 0.45, 0.2
@@ -133,6 +135,47 @@ def test_of_a_finished_part_they_are_told_too(small: Small, last: Look) -> None:
     cut = replace(
         job, layers=job.layers[: LAST + 1], beads=job.beads.subset(job.beads.layer <= LAST)
     )
-    late = afterwards(plan, cut, small.template, small.setup, command="gcode resume-at JOB")
+    whole = m3.Manifold.cube((*SIZE_MM[:2], LAYER_MM * (LAST + 1)))
+    part = MeshSdf.from_mesh(solid_mesh(whole))
+    late = afterwards(plan, cut, part, small.setup, command="gcode resume-at JOB")
     assert late.told[0].startswith(f"layers {THIN[0]} to {THIN[-1]} lack about")
     assert late.ways[-1].name == "leave"
+
+
+def test_the_floor_of_a_large_notch_is_no_thin_layer(small: Small, last: Look) -> None:
+    # regression: of a camera's mount that had lost its upper third but for two ears, the layers at
+    # the notch's floor were told to lack 35 % of their plastic, with 0 mm3 open inside
+    stop, floor_mm = stop_after(small, LAST), 9 * LAYER_MM
+    site = sites(small.job, small.template, small.placed, small.setup)(stop)
+    wall_mm = walls(small, {}, 0)[0]
+    floor = np.random.default_rng(1).random((8_000, 3)) * (*SIZE_MM[:2], 0.0) + PLACE_MM
+    floor[:, 2] += floor_mm + np.random.default_rng(2).normal(scale=0.08, size=len(floor))
+    place_mm = np.concatenate([wall_mm[wall_mm[:, 2] < floor_mm], floor])
+    anomaly = replace(
+        last.plan.anomaly,
+        points_mm=last.plan.build_from_template.inverse().apply(place_mm),
+        deviation_mm=site.expected.distance(small.placed.inverse().apply(place_mm)),
+        score=np.zeros(len(place_mm)),
+        label=np.zeros(len(place_mm), np.int64),
+    )
+    box_mm = np.array([[0.0, 0.0, floor_mm], [*SIZE_MM[:2], 3.0]]) + PLACE_MM
+    notch = Region(Label.MISSING, DefectType.CHIP, 230.0, 200.0, 3.0 - floor_mm, box_mm)
+    plan = replace(
+        last.plan, covered=None, anomaly=anomaly, deficit=replace(last.plan.deficit, regions=())
+    )
+    deficit = replace(plan.deficit, regions=(notch,))
+    found = thin_layers(*_on_part(plan, site.expected, DEFAULT_THIN), small.job, stop)
+    assert found is not None  # not knowing of the notch
+    seen = replace(plan, deficit=deficit)
+    assert thin_layers(*_on_part(seen, site.expected, DEFAULT_THIN), small.job, stop) is None
+    assert with_covered(seen, small.job, site.expected, stop).covered is None
+
+
+def test_a_job_of_another_part_is_told_and_asked_for_nothing(small: Small, last: Look) -> None:
+    # regression: a mount was repaired with --job of another part, 6 mm high, without a word
+    plan = replace(last.plan, covered=None)
+    other = MeshSdf.from_mesh(solid_mesh(m3.Manifold.cylinder(4.0, 9.0, 2.0)))
+    late = afterwards(plan, small.job, other, small.setup, command="gcode resume-at JOB")
+    assert late.covered == ""
+    assert "prints another part" in late.told[-1]
+    assert "only the heights of its layers" in late.told[-1]
