@@ -243,7 +243,7 @@ def floors(z, iy, ix, seen, origin, cell, radius, band, most_spread, steepest):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(inner=True, cache=True, nogil=True)
 def nearest_over(cloud, x, y, i, j, over, under, reach, within):
     """How far from a place the nearest point between two heights lies, up to `within`."""
     start, points = cloud

@@ -38,14 +38,19 @@ class UnmetRays:
 
     @classmethod
     def of(cls, images: tuple[RangeImage, ...], stands_mm: Points, size_mm: float) -> UnmetRays:
-        """Of images, and the middles of cubes that stand."""
-        unmet = [np.pad(~np.isfinite(i.depth_mm), 1, constant_values=True) for i in images]
-        stands = [_covered(i, stands_mm, size_mm) for i in images]
-        return cls(
-            images,
-            tuple(u & ~s for u, s in zip(unmet, stands, strict=True)),
-            tuple(u & s for u, s in zip(unmet, stands, strict=True)),
-        )
+        """Of images, and the middles of cubes that stand.
+
+        Of an image in which more rays got lost than met what stands, as of a few touches, no ray is
+        known to have left.
+        """
+        left, lost = [], []
+        for image in images:
+            met = np.pad(np.isfinite(image.depth_mm), 1)
+            stands = _covered(image, stands_mm, size_mm)
+            lost.append(~met & stands)
+            sees = lost[-1].sum() <= (met & stands).sum()
+            left.append(~met & ~stands & sees)
+        return cls(images, tuple(left), tuple(lost))
 
     def left_through(self, points_mm: Points) -> Mask:
         """(n,) points through which more rays left than got lost in line with them."""
