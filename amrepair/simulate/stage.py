@@ -195,7 +195,8 @@ class Stage:
         ----------
         measure
             Whether to measure the last stop's defects once more: what was too thin for beads of its
-            own is filled by the next layer's.
+            own is filled by the next layer's. The reference takes their flow as well, so that its
+            top is too high there by what they fill.
         """
         self._print_job(self._take_motion())
         if measure and self._stops:
