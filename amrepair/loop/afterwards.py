@@ -72,13 +72,13 @@ def afterwards(
         That makes the job that is left, without the layer.
     """
     *_, end = plan_stops(job, ())
+    placed, (copies, other) = plan.build_from_template, _copies(job, template, setup)
     aside = shifted(plan, job, template)
     # held against the job's beads: only where the part stands at their place
-    stands = aside and not _why_not_again(job, template, plan.build_from_template, setup)
+    stands = aside and not (other or _why_not_again(job, template, copies, placed, setup))
     if aside is not None and aside.layer is not None and stands:
         again = printed_again(aside.layer, job, end, setup, command=command)
         return Afterwards(0.0, (again,), "", f"{aside.told}; no patch mends that")
-    other = _of_another_part(job, template, setup)
     if not other:  # walls and beads of another part say nothing of this one's
         plan = with_covered(plan, job, template, end)
     left = buried(pieces_of(plan, ()), end, plan.layer_height_mm, plan.policy)
@@ -88,30 +88,32 @@ def afterwards(
     offered = ways(left, job, end, setup, command=command)
     not_again = "it begins in the first layer, and nothing would stand there"
     if other or len(offered) > 1:
-        not_again = other or _why_not_again(job, template, plan.build_from_template, setup)
+        not_again = other or _why_not_again(job, template, copies, placed, setup)
     if not_again:
         offered = tuple(way for way in offered if way.layer is None)
     covered = "" if plan.covered is None else plan.covered.told
     return Afterwards(open_mm3, offered, not_again, covered)
 
 
-def _of_another_part(job: Job, template: Template, setup: PrintSetup) -> str:
-    """Why a job is none of the part; empty where it prints it."""
+def _copies(job: Job, template: Template, setup: PrintSetup) -> tuple[tuple[Transform, ...], str]:
+    """Where a job prints the part, build from template; and why it is a job of another, if so."""
     try:
-        locate_parts(job, template, layer_height_mm=setup.process.layer_height_mm)
+        found = locate_parts(job, template, layer_height_mm=setup.process.layer_height_mm)
     except AlignmentError as error:
-        return f"{error}; of this job only the heights of its layers were taken"
-    return ""
+        return (), f"{error}; of this job only the heights of its layers were taken"
+    return found, ""
 
 
-def _why_not_again(job: Job, template: Template, placed: Transform, setup: PrintSetup) -> str:
+def _why_not_again(
+    job: Job,
+    template: Template,
+    copies: tuple[Transform, ...],
+    placed: Transform,
+    setup: PrintSetup,
+) -> str:
     """Why a job's later layers would not fall onto a part that stands there; empty if they do."""
     if len(job.turns) > 1:
         return "it prints its objects one after the other"
-    try:
-        copies = locate_parts(job, template, layer_height_mm=setup.process.layer_height_mm)
-    except AlignmentError as error:
-        return str(error)
     if len(copies) > 1:
         return f"it prints {len(copies)} of the part, and the others with it"
     surface_mm, _ = template.surface_points(SURFACE_STEP_MM)
