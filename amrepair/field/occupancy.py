@@ -177,7 +177,8 @@ def _guessed(
     void = designed & ~solid
     ends, scanned = np.zeros_like(void), {}
     width_mm = scan.width_mm(grid.voxel_mm)
-    for side, index, middle_mm in _facets_toward(void, designed & solid, grid):
+    facets = list(_facets_toward(void, designed & solid, grid))
+    for side, index, middle_mm in facets:
         ends |= _marked(void, index)
         scanned[side] = _marked(void, index[_is_scanned(middle_mm, width_mm, scan)])
     if not ends.any():
@@ -189,7 +190,7 @@ def _guessed(
     if len(ways):
         hull = _hull_of(scan)
         in_view = _in_one_view(void, ways, hull, scan, grid)
-        in_view |= _looked_into(void, scanned, surface, ways, hull, scan, grid)
+        in_view |= _looked_into(void, facets, scanned, surface, ways, hull, scan, grid)
         return void & ~in_view
     (box,) = ndimage.find_objects(void.astype(np.int8))
     # a gap in what was scanned of an end, no wider than points are asked for, is chance
@@ -213,7 +214,7 @@ def _guessed(
         guessed[box] &= _as_it_looks(guess - least * ends[box]) > 0
     if guessed.any():
         hull = _hull_of(scan)
-        guessed &= ~_looked_into(void, scanned, surface, ways, hull, scan, grid)
+        guessed &= ~_looked_into(void, facets, scanned, surface, ways, hull, scan, grid)
     return guessed
 
 
@@ -266,6 +267,7 @@ def _in_one_view(
 
 def _looked_into(
     void: VoxelMask,
+    facets: list[tuple[tuple[int, int], Int[np.ndarray, "j 3"], Float[np.ndarray, "j 3"]]],
     scanned: dict[tuple[int, int], VoxelMask],
     surface: tuple[Points, Points, Mask],
     ways: Float[np.ndarray, "k 3"],
@@ -279,6 +281,11 @@ def _looked_into(
     What hides a part of the surface ends not just where its faces meet: what lies beside hidden
     surface, and does not face away from it, may be hidden, too. Nor would surface have been seen
     beyond all that was: there the scanner's view may have ended.
+
+    Parameters
+    ----------
+    facets
+        Where the void ends at what stands, as `_facets_toward` tells it.
     """
     places_mm, normals, seen = surface
     within_mm = scan.options.seen_spacings * scan.spacing_mm + grid.voxel_mm
@@ -286,7 +293,7 @@ def _looked_into(
     sides = list(_facets_toward(void, grid.f_mm >= 0, grid))
     gone = np.zeros_like(seen)
     if not len(ways):  # one view looked its own way, not straight down
-        gone = _seen_through(void, sides, surface, within_mm, scan, grid)
+        gone = _seen_through(void, facets, sides, surface, within_mm, scan, grid)
     hidden = _hidden(normals, seen, gone, scan.options)
     for (axis, way), index, middle_mm in sides:
         toward = hidden & (way * normals[:, axis] > -scan.options.way_cosine)
@@ -305,6 +312,7 @@ def _looked_into(
 
 def _seen_through(
     void: VoxelMask,
+    facets: list[tuple[tuple[int, int], Int[np.ndarray, "j 3"], Float[np.ndarray, "j 3"]]],
     sides: list[tuple[tuple[int, int], Int[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]],
     surface: tuple[Points, Points, Mask],
     within_mm: float,
@@ -315,7 +323,7 @@ def _seen_through(
     places_mm, normals, seen = surface
     gone, mouths = np.zeros_like(seen), {side: (index, at_mm) for side, index, at_mm in sides}
     faced, width_mm = np.abs(scan.broken.plane) > LEAST_FACING, scan.width_mm(grid.voxel_mm)
-    for (axis, way), index, middle_mm in _facets_toward(void, (grid.f_mm < 0) & ~void, grid):
+    for (axis, way), index, middle_mm in facets:
         told = has_near(middle_mm, scan.broken.place_mm[faced[:, axis]], width_mm)
         over = _along(void, _marked(void, index[told]), axis, -way)
         mouth, mouth_mm = mouths[axis, -way]
