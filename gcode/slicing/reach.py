@@ -18,10 +18,14 @@ from gcode.surfaces import HeightField
 # So deep the flat may press into the plastic beside it, and the body lie in the noise of the field;
 # with what a scan gets wrong it stays under the checker's limits, 0.2 and 0.1 mm.
 PRESS_MM = 0.06
-# A wall may stand this much nearer than its cells say. Beside a cone half a cell is half a cell of
-# depth and no wall: there it only keeps a rim that just touches a cell from being taken to miss it.
+# A wall may stand this much nearer than its cells say: beside the flat, where a hundredth counts.
+# Beside a cone half a cell is half a cell of depth and no wall: there it only keeps a rim that just
+# touches a cell from being taken to miss it.
 SIDE_MM = 0.03
 CONE_SIDE_MM = 0.01
+# What reaches farther than a nozzle's hexagon, a block or a carriage, keeps off by a column more:
+# it passes many walls at once, and one column that a scan tells too low is enough to graze one.
+HEXAGON_MM = 6.0
 # In cells of this size; in wider ones a cone, which rises by one in one, reads as much deeper.
 PRESS_CELL_MM = 0.1
 LEAST_TOLD_MM = 0.1
@@ -54,6 +58,7 @@ def least_tip(
         )
         deeper_mm = max(field.cell_mm - PRESS_CELL_MM, 0.0)
         return under_mm - part.z_from_mm - max(PRESS_MM - deeper_mm, 0.0)
+    side_mm = SIDE_MM if part.reach_mm <= HEXAGON_MM else field.cell_mm
     rows, columns = (finer * (w.stop - w.start) for w in window)
     least = np.empty((rows, columns))
     cell_mm = field.cell_mm / finer
@@ -61,7 +66,7 @@ def least_tip(
         for ix in range(finer):
             dx, dy = ((k - 0.5 * (finer - 1)) * cell_mm for k in (ix, iy))
             moved = [(x + dx, y + dy) for x, y in part.polygon_mm]
-            under_mm = field.max_within(moved, window, aside_mm=0.5 * cell_mm + SIDE_MM)
+            under_mm = field.max_within(moved, window, aside_mm=0.5 * cell_mm + side_mm)
             least[iy::finer, ix::finer] = under_mm - part.z_from_mm - PRESS_MM
     return least
 

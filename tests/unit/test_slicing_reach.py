@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gcode.check.sweep import deepest_along
 from gcode.profiles import load_setup
 from gcode.slicing import reach_kernels
-from gcode.slicing.reach import PRESS_MM, Reach
+from gcode.slicing.reach import HEXAGON_MM, PRESS_MM, Reach
 from gcode.surfaces import HeightField
 
 
@@ -139,3 +139,24 @@ def test_the_tip_may_go_nowhere_that_the_checker_refuses(seed: int) -> None:
     reach = Reach(field, printer, window_mm=(-2.0, -2.0, 2.0, 2.0), finer=finer)
     places_mm = np.column_stack([reach.centres_mm(), reach.need_mm.ravel()])
     assert deepest_along(places_mm, printer, field).max() <= 0.0
+
+
+def test_a_block_keeps_a_column_off_the_top_of_a_wall() -> None:
+    # regression: of a worn part one column at the top of the wall was told 1 mm too low, 14.1 mm
+    # from the nozzle, whose block reaches 14.0: it went 0.74 mm deep into the wall beside
+    printer = load_setup(printer="prusa_mk3s").printer
+    part = next(p for p in printer.head if p.reach_mm > HEXAGON_MM)
+    reach_mm, below_mm = max(x for x, _ in part.polygon_mm), part.z_from_mm + 1.0
+    z_mm = np.zeros((60, 260))
+    z_mm[:, 200:] = below_mm + 5.0  # stands 20 mm from the left edge
+    told_mm = z_mm.copy()
+    told_mm[:, 200] = 0.0  # as a scan tells it
+    seen = np.ones(z_mm.shape, dtype=bool)
+    window = (0.0, 2.0, 19.0, 4.0)
+    reach = Reach(HeightField(np.zeros(2), 0.1, told_mm, seen), printer, window_mm=window, finer=2)
+    x = reach.cell_mm * (np.flatnonzero(reach.at(5.0)[20]) + 0.5)
+    x = x[x > 20.0 - 0.5 - reach_mm]
+    tips = np.column_stack([x, np.full(len(x), 3.0), np.full(len(x), 5.0)])
+    truth = HeightField(np.zeros(2), 0.1, z_mm, seen)
+    assert len(x) > 0
+    assert (deepest_along(tips, printer, truth) <= 0).all()
