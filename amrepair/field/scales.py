@@ -154,7 +154,7 @@ def _scale(
     place = np.add.reduceat((place_mm * weight[:, None])[order], first) / total[:, None]
     facing = unit_vectors(np.add.reduceat((normal * weight[:, None])[order], first))
     value = (
-        kernels.group_medians(order, start, value_mm)
+        kernels.group_medians(order, start, value_mm, weight)
         if medians
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )

@@ -39,6 +39,25 @@ def median(values, n):
 
 
 @njit(inner=True, cache=True, nogil=True)
+def weighted_median(values, weights, n):
+    """The median of what the first n values stand for, each so many observations; put in order."""
+    whole = 0.0
+    for k in range(n):
+        whole += weights[k]
+    for k in range(1, n):
+        value, weight, j = values[k], weights[k], k
+        while j > 0 and values[j - 1] > value:
+            values[j], weights[j] = values[j - 1], weights[j - 1]
+            j -= 1
+        values[j], weights[j] = value, weight
+    below, k = weights[0], 0
+    while 2.0 * below < whole and k < n - 1:
+        k += 1
+        below += weights[k]
+    return 0.5 * (values[k] + values[k + 1]) if 2.0 * below == whole and k < n - 1 else values[k]
+
+
+@njit(inner=True, cache=True, nogil=True)
 def _alike(normal, value, i, j, cosine, aside):
     """Whether two cells face the same way, or both are more than `aside` off on the same side.
 
@@ -132,16 +151,17 @@ def window_statistics(table, count, place, value, weight, rank):
     out = np.empty((5, n))
     for i in prange(n):
         here, apart = np.empty(MOST_NEIGHBOURS), np.empty(MOST_NEIGHBOURS)
+        told = np.empty(MOST_NEIGHBOURS)
         # counts and places as whole numbers of one kind: else what is called is compiled for two
         size, own, others, total = np.int64(count[i]), np.int64(i), 0, 0.0
         for k in range(count[i]):
             j = table[i, k]
-            here[k] = value[j]
+            here[k], told[k] = value[j], weight[j]
             total += weight[j]
             if j != i:
                 apart[others] = abs(value[j] - value[i])
                 others += 1
-        out[0, i] = median(here, size)
+        out[0, i] = weighted_median(here, told, size)
         at = min(rank, count[i]) - 1
         out[1, i], out[2, i] = here[at], here[count[i] - 1 - at]
         out[3, i] = median(apart, others) / PAIR_MEDIAN if others >= rank else np.nan
@@ -151,6 +171,18 @@ def window_statistics(table, count, place, value, weight, rank):
             spread = median(apart, size) / NORMAL_MEDIAN
             out[3, i] = min(out[3, i], spread * np.sqrt(count[i] / (count[i] - 3.0)))
         out[4, i] = total
+    return out
+
+
+@njit(cache=True, nogil=True)
+def most_of_ranked(table, count, value, told, rank):
+    """(s,) the most that is told of a window's `rank` lowest and of its `rank` highest cells."""
+    out = np.empty(table.shape[0])
+    for i in range(table.shape[0]):
+        own = table[i, : count[i]]
+        ranked = told[own[np.argsort(value[own])]]
+        at = min(rank, count[i])
+        out[i] = max(ranked[:at].max(), ranked[count[i] - at :].max())
     return out
 
 
@@ -194,16 +226,17 @@ def window_medians(table, count, value):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def group_medians(order, start, value):
-    """(g,) median of the values of each group."""
+def group_medians(order, start, value, weight):
+    """(g,) median of the observations that the values of each group stand for."""
     n = start.shape[0] - 1
     out = np.empty(n)
     for i in prange(n):
         size = start[i + 1] - start[i]
-        here = np.empty(size)
+        here, told = np.empty(size), np.empty(size)
         for k in range(size):
-            here[k] = value[order[start[i] + k]]
-        out[i] = median(here, size)
+            j = order[start[i] + k]
+            here[k], told[k] = value[j], weight[j]
+        out[i] = weighted_median(here, told, size)
     return out
 
 

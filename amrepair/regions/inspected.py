@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from amrepair.arrays import Mask, Points, Values
 from amrepair.field.near import nearest_within
+from amrepair.field.scales import WINDOW_FACING
 from amrepair.frames import diagonal
 from amrepair.observe.background import ON_PLANE_MM
 from amrepair.observe.incidence import incidence
@@ -117,6 +118,7 @@ def inspected_of(
     place_mm = np.concatenate([surfels.place_mm, crossed_mm, ends.place_mm])
     if spread is not None:
         tolerance_mm += TOLERATED_SPREADS * spread(place_mm)
+    sheets_mm = _sheets_apart_mm(seen, anywhere_mm, options)
     unknown = _behind_what_stands(seen, anywhere_mm, options)
     tolerance_mm[:, : len(surfels)][:, unknown] += diagonal(template.bounds_mm)
     if off_by_job is not None:
@@ -131,7 +133,7 @@ def inspected_of(
         weight=np.concatenate([surfels.count, np.full(len(crossed_mm), usual_count), ends.count]),
         tolerance_mm=tolerance_mm,
         facing=np.append(facing, np.full(others, usual_facing)),
-        pose_mm=np.concatenate([np.zeros(len(surfels)), crossed.error_mm, np.zeros(len(ends))]),
+        pose_mm=np.concatenate([sheets_mm, crossed.error_mm, np.zeros(len(ends))]),
         ends=len(ends),
         shares=seen.shares,
     )
@@ -176,6 +178,35 @@ def _behind_what_stands(seen: Observed, tolerance_mm: float, options: RegionOpti
     stands = (near >= 0) & (np.abs(surfels.deviation_mm[near]) <= tolerance_mm)
     to_guess_mm = coverage.to_guess_mm(surfels.place_mm[deep])
     found[deep] = stands & (to_guess_mm < options.guess_depths * depth_mm)
+    return found
+
+
+def _sheets_apart_mm(seen: Observed, tolerance_mm: float, options: RegionOptions) -> Values:
+    """(s,) standard error of cells where two sheets of points lie along the template.
+
+    Nobody sees through plastic, and what is thinner than two beads seldom stands for itself: of
+    two sheets at one place, one on the template's surface and one along it above or below, no
+    farther apart than that, one is off. Which, the points do not tell, so that either is as
+    uncertain as their spread about their mean.
+    """
+    surfels, outward, off_mm = seen.surfels, seen.outward, seen.surfels.deviation_mm
+    found = np.zeros(len(surfels))
+    on = np.abs(off_mm) <= tolerance_mm
+    most_mm = options.sheet_beads * options.evidence.occupancy.bead_mm
+    apart = np.abs(off_mm) > max(tolerance_mm, surfels.cell_mm)
+    far = np.flatnonzero(apart & (np.abs(off_mm) < most_mm))
+    sound = np.flatnonzero(on)
+    feet_mm = surfels.place_mm[far] - off_mm[far, None] * outward[far]
+    under = nearest_within(feet_mm, surfels.place_mm[sound], surfels.cell_mm)
+    far, under = far[under >= 0], sound[under[under >= 0]]
+    # a break's sides stand across the surface that they begin at
+    others = replace(surfels, moments=np.where(on[:, None], 0.0, surfels.moments))
+    along = np.abs((others.planes(far) * outward[far]).sum(axis=1)) > WINDOW_FACING
+    far, under = far[along], under[along]
+    share = surfels.count[far] / (surfels.count[far] + surfels.count[under])
+    spread_mm = np.abs(off_mm[far] - off_mm[under]) * np.sqrt(share * (1.0 - share))
+    for sheet in (far, under):
+        np.maximum.at(found, sheet, spread_mm)
     return found
 
 

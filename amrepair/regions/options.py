@@ -186,6 +186,9 @@ class RegionOptions:
     guess_depths
         A cell behind surface that stands is not judged if a place where the template was guessed
         lies within this many times the cell's depth.
+    sheet_beads
+        Two sheets of points at one place are an error if they lie closer than so many beads, as no
+        thinner wall stands between them: slicers make one of two beads at least.
     wall_ends, background, surfels, evidence
         Options for the ends of thin walls, for what is not the part, for condensing the scan, and
         for the space around broken surface.
@@ -214,6 +217,7 @@ class RegionOptions:
     bed_windows: int = 1000
     spacing_mm: float = 0.6
     guess_depths: float = 2.0
+    sheet_beads: float = 2.0
     wall_ends: WallEndOptions = field(default_factory=WallEndOptions)
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
     surfels: SurfelOptions = field(default_factory=SurfelOptions)

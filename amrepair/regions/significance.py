@@ -258,18 +258,24 @@ def tested(
     levels = []
     for k, scale in enumerate(scales):
         size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
-        cells = (
+        cells = [
             np.bincount(scale.of_base, told, len(scale)) / size
             for told in (*inspected.tolerance_mm, inspected.facing, inspected.pose_mm)
+        ]
+        *delta, faced = (
+            scales_kernels.window_means(scale.table, scale.count, told) for told in cells[:-1]
         )
-        *delta, faced, pose = (
-            scales_kernels.window_means(scale.table, scale.count, told) for told in cells
+        poses = (
+            scales_kernels.most_of_ranked(
+                scale.table, scale.count, scale.value_mm, cells[-1], RANK
+            ),
+            scales_kernels.window_medians(scale.table, scale.count, cells[-1]),
         )
         group = seen_class(scale, faced, options.seen_step)
         most_mm = options.most_wander * point_sigma_mm(scales[0])
         views = ViewErrors.of(scale, said)
         by_cells, by_means = _errors(
-            scale, group, faced, pose, views, options, calibration, most_mm
+            scale, group, faced, poses, views, options, calibration, most_mm
         )
         allowed_mm = np.stack(delta)
         means = np.stack([-scale.median_mm, scale.median_mm])
@@ -290,7 +296,7 @@ def _errors(
     scale: Scale,
     group: Numbers,
     facing: Values,
-    pose_mm: Values,
+    poses_mm: tuple[Values, Values],
     views: ViewErrors,
     options: RegionOptions,
     calibration: Calibration | None,
@@ -298,7 +304,8 @@ def _errors(
 ) -> tuple[Errors, Errors]:
     """The standard errors of a scale, of its cells and of its windows' medians.
 
-    They are independent from cell to cell, and common to windows. Windows far apart tell what they
+    They are independent from cell to cell, and common to windows; `poses_mm` is what adds to the
+    latter, of the `RANK`-th cells and of windows. Windows far apart tell what they
     have in common, and so do views of the same window, which are right too where fewer of them saw
     a place; they tell of the same errors, and the larger counts.
     """
@@ -317,7 +324,7 @@ def _errors(
     least = float(np.partition(facing, few)[few])
     by_wander = (wander[group] * aslant) ** 2 - options.process_sigma_mm**2
     found = []
-    for seen_by in (views.cell_by, views.window_by):
+    for seen_by, pose_mm in zip((views.cell_by, views.window_by), poses_mm, strict=True):
         errs = np.maximum(by_wander, views.one_mm**2 / seen_by) - window**2
         common = np.sqrt(np.maximum(errs, 0.0) + pose_mm**2)
         found.append(Errors(cell, window, common, wander, freedom, group, least))
