@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import manifold3d
+
 from amrepair.loop.buried_defects import (
     buried,
     buried_mm3,
@@ -89,10 +91,25 @@ def decide_look(
 
 
 def _stuck(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
-    """Whether the last repair at this stop changed next to nothing."""
+    """Whether the last repair at this stop changed next to nothing of what it was to fill."""
     if not here or not here[-1].printed:
         return False
-    return is_stuck(here[-1].plan.deficit.missing_mm3, plan.deficit.missing_mm3, policy)
+    before = here[-1].plan.deficit.missing
+    return is_stuck(before.volume(), _left_in_place_mm3(before, plan.deficit.missing), policy)
+
+
+def _left_in_place_mm3(before: manifold3d.Manifold, now: manifold3d.Manifold) -> float:
+    """How much of what is missing now was missing there before.
+
+    A later look also sees what an earlier one was not sure of, which no repair has tried to fill.
+    Two scans of one defect differ at its rim, so a piece that mostly lies in what was missing
+    counts whole; any other by what it shares with that.
+    """
+    left_mm3 = 0.0
+    for piece in now.decompose():
+        whole_mm3, shared_mm3 = piece.volume(), (piece ^ before).volume()
+        left_mm3 += whole_mm3 if shared_mm3 > 0.5 * whole_mm3 else shared_mm3
+    return left_mm3
 
 
 def _done(looks: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:

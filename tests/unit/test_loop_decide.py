@@ -5,11 +5,16 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import manifold3d
 import numpy as np
 import pytest
 
 from amrepair.loop.findings import _whole_defects
+from amrepair.loop.situation import _stuck
+from amrepair.policy import DEFAULT_POLICY
 from amrepair.policy.table import (
     FINDINGS,
     STOP_ROWS,
@@ -114,6 +119,32 @@ def test_what_is_not_surely_in_the_heads_way_is_looked_at_twice_before_the_print
     again = replace(unsure, seen_twice=True)
     assert judge(again).action is Action.PAUSE
     assert judge(replace(again, object="lid")).action is Action.GIVE_UP
+
+
+@pytest.mark.parametrize(
+    ("left_at_mm", "size_mm", "tells_stuck"),
+    [
+        # regression: three chips were filled, two skipped lines elsewhere were seen only then, and
+        # "the last pass left most of what it found" left them open
+        ((20.0, 0.0, 0.0), (7.0, 2.0, 0.2), False),
+        ((7.9, 0.0, 0.0), (7.5, 2.0, 0.2), False),  # it goes on beside what was filled
+        ((0.3, 0.1, 0.0), (8.0, 2.0, 0.2), True),  # the same, as another scan has it
+        ((1.0, 0.0, 0.0), (4.0, 2.0, 0.2), False),  # half of it was filled
+    ],
+)
+def test_a_repair_is_stuck_where_it_leaves_what_it_was_to_fill(
+    left_at_mm: tuple[float, float, float],
+    size_mm: tuple[float, float, float],
+    tells_stuck: bool,
+) -> None:
+    def plan(missing: manifold3d.Manifold) -> Any:
+        deficit = SimpleNamespace(missing=missing, missing_mm3=missing.volume())
+        return SimpleNamespace(deficit=deficit)
+
+    cube = manifold3d.Manifold.cube
+    last = SimpleNamespace(printed=True, plan=plan(cube((8.0, 2.0, 0.2))))
+    now = plan(cube(size_mm).translate(left_at_mm))
+    assert _stuck([last], now, DEFAULT_POLICY) is tells_stuck  # type: ignore[list-item]
 
 
 def test_a_speck_in_the_heads_way_does_not_end_a_print() -> None:
