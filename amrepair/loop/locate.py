@@ -65,12 +65,14 @@ UPRIGHT = math.cos(math.radians(0.5))  # walls of a low part tell its tilt to a 
 class _Inset:
     """A template shrunk by `depth_mm` (`Template`, as far as an alignment asks it).
 
-    Where it is known which way is `up`, along its layers, as slicers lay walls: of a slope that is
-    less across it, by its sine, and of a top nothing.
+    Where it is known which way is `up`, as beads are: half as wide along its layers, and half as
+    high, `high_mm`, under a top and over a bottom. In between an ellipse tells how far a bead's
+    middle is from the surface that it touches.
     """
 
     whole: Template
     depth_mm: float
+    high_mm: float
     up: Float[np.ndarray, " 3"] | None = None
 
     @property
@@ -88,13 +90,17 @@ class _Inset:
 
     def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         distance, gradient = self.whole.distance_and_gradient(points_mm)
-        return distance + self.depth_mm * self.level(gradient), gradient
+        if self.up is None:
+            return distance + self.depth_mm, gradient
+        level = self.level(gradient)
+        deep_mm = np.hypot(self.depth_mm * level, self.high_mm * np.sqrt(1.0 - level**2))
+        return distance + deep_mm, gradient
 
     def level(self, gradient: Points) -> Values:
         """(n,) how much of a move along a layer is across each surface."""
         if self.up is None:
             return np.ones(len(gradient))
-        return np.sqrt(np.maximum(1.0 - (gradient @ self.up) ** 2, 0.0))
+        return np.sqrt(np.clip(1.0 - (gradient @ self.up) ** 2, 0.0, 1.0))
 
     def surface_points(
         self, spacing_mm: float
@@ -146,7 +152,7 @@ def locate_parts(
     outer = ours & of_roles(beads, OUTER_WALLS)
     pick = outer if outer.any() else ours
     half_mm = _half_bead_mm(beads, pick)
-    inset = _Inset(template, half_mm)
+    inset = _Inset(template, half_mm, 0.5 * float(np.median(beads.height_mm[pick])))
     thing = _things(beads.start_mm[ours, :2], beads.end_mm[ours, :2], half_mm)
     if not outer.any():
         higher = _of_what_rises(beads.layer[ours], thing)
@@ -361,7 +367,9 @@ def walls_moved_mm(job: Job, template: Template, placed: Transform) -> float:
     pick = (beads.layer >= 0) & of_roles(beads, OUTER_WALLS)
     if not pick.any():
         return 0.0
-    inset = _Inset(template, _half_bead_mm(beads, pick))
+    inset = _Inset(
+        template, _half_bead_mm(beads, pick), 0.5 * float(np.median(beads.height_mm[pick]))
+    )
     walls = _Walls(_walls(beads, np.flatnonzero(pick))).told_off(inset, placed)
     return abs(walls.outside_mm) + abs(walls.stretch) * walls.half_mm
 
@@ -382,8 +390,13 @@ def _nth(number: int) -> str:
 
 
 def _untilted(placed: Transform, template: Template) -> Transform:
-    """The pose turned about Z alone, where it is upright: slicers do not tilt, walls waver."""
-    if not is_upright(placed):
+    """The pose turned about Z alone, where it is upright: slicers do not tilt, walls waver.
+
+    Of a low part the walls tell its tilt by no more than they lie off over its height.
+    """
+    leans_mm = float(np.hypot(*placed.matrix[:2, 2])) * float(np.ptp(template.bounds_mm[:, 2]))
+    stands = placed.matrix[2, 2] > 0.0 and leans_mm < MOVED_MM
+    if not (stands or is_upright(placed)):
         return placed
     turn_rad = float(np.arctan2(placed.matrix[1, 0], placed.matrix[0, 0]))
     turn = rotation_from_vector(np.array([0.0, 0.0, turn_rad]))

@@ -177,6 +177,28 @@ def test_another_thing_beside_the_part_is_refused_with_its_number() -> None:
         locate_parts(job_of(plate), template, layer_height_mm=LAYER_MM)
 
 
+def hooked(holed: bool) -> m3.Manifold:
+    """A plate that is told from its twin by a hole alone."""
+    whole = m3.Manifold.cube((12.0, 9.0, 2.0)) - m3.Manifold.cube((6.0, 4.0, 9.0))
+    return whole - m3.Manifold.cylinder(9.0, 1.5, 1.5, 24).translate(
+        (9.0, 5.0, -1.0 if holed else 5.0)
+    )
+
+
+def test_a_low_part_is_found_upright_whatever_its_tops_and_bottoms_hide() -> None:
+    """A washer of 0.4 mm was refused: its walls lie nearer to a flat than half a bead, and were
+    held to lie 0.1 mm off. Of plates of 0.4 and 2 mm the walls told a tilt of 0.8 degrees.
+    """
+    washer = m3.Manifold.cylinder(0.4, 3.8, 3.8, 64) - m3.Manifold.cylinder(3.0, 1.75, 1.75, 64)
+    plate = hooked(holed=False)
+    for part in (washer, plate, plate.scale((1.0, 1.0, 0.2))):
+        template = MeshSdf.from_mesh(solid_mesh(part))
+        job = job_of(part.translate((80.0, 60.0, 0.0)))
+        placed = locate_part(job, template, layer_height_mm=LAYER_MM)
+        assert placed.rotation[2, 2] == 1.0
+        assert placed.translation_mm == pytest.approx([80.0, 60.0, 0.0], abs=0.05)
+
+
 def test_a_pit_in_the_second_copy_is_found_there() -> None:
     truths = [pose((0.0, 0.0, 0.0), 60.0, 60.0), pose((0.0, 0.0, 90.0), 90.0, 60.0)]
     copies = [wedge().transform(t) for t in truths]
