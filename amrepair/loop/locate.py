@@ -60,6 +60,7 @@ MOST_STRETCH = 0.02  # polypropylene's; more is another scale
 # some slicers reckon with those and some without.
 BEAD_SIDES_RATIO = 0.5 * (1.0 - math.pi / 4.0)
 OFF_LAYERS = 1.5  # walls tell the height to about a layer; a raft has two and more
+FLAT = 0.1  # of a top's or a bottom's normal along the layers: within 6 degrees
 UPRIGHT_SIDE = 0.5  # of a side's normal along Z: steeper than 60 degrees
 UPRIGHT = math.cos(math.radians(0.5))  # walls of a low part tell its tilt to a third of a degree
 
@@ -68,9 +69,9 @@ UPRIGHT = math.cos(math.radians(0.5))  # walls of a low part tell its tilt to a 
 class _Inset:
     """A template shrunk by `depth_mm` (`Template`, as far as an alignment asks it).
 
-    Where it is known which way is `up`, as beads are: half as wide along its layers, and half as
-    high, `high_mm`, under a top and over a bottom. In between an ellipse tells how far a bead's
-    middle is from the surface that it touches.
+    Where it is known which way is `up`, along its layers, as slicers lay walls: of a slope that is
+    less across it, by its sine. Under a flat top and over a flat bottom it is `high_mm`, half a
+    layer, whatever the wall.
     """
 
     whole: Template
@@ -96,14 +97,13 @@ class _Inset:
         if self.up is None:
             return distance + self.depth_mm, gradient
         level = self.level(gradient)
-        deep_mm = np.hypot(self.depth_mm * level, self.high_mm * np.sqrt(1.0 - level**2))
-        return distance + deep_mm, gradient
+        return distance + np.where(level < FLAT, self.high_mm, self.depth_mm * level), gradient
 
     def level(self, gradient: Points) -> Values:
         """(n,) how much of a move along a layer is across each surface."""
         if self.up is None:
             return np.ones(len(gradient))
-        return np.sqrt(np.clip(1.0 - (gradient @ self.up) ** 2, 0.0, 1.0))
+        return np.sqrt(np.maximum(1.0 - (gradient @ self.up) ** 2, 0.0))
 
     def surface_points(
         self, spacing_mm: float
@@ -213,7 +213,7 @@ def locate_plate(
     stands = []
     for (which, placed), layer in zip(found, layers, strict=True):
         template, begins_mm = templates[which], _begins_mm(job, layer)
-        upright = _untilted(placed, template)
+        upright = _untilted(placed, template, 0.5 * layer_height_mm)
         stands.append(Located(which, _on_foot(upright, template, begins_mm, layer_height_mm)))
     return tuple(stands)
 
@@ -489,13 +489,13 @@ def _nth(number: int) -> str:
     return {1: "first", 2: "second", 3: "third"}.get(number, f"{number}th")
 
 
-def _untilted(placed: Transform, template: Template) -> Transform:
+def _untilted(placed: Transform, template: Template, off_mm: float) -> Transform:
     """The pose turned about Z alone, where it is upright: slicers do not tilt, walls waver.
 
-    Of a low part the walls tell its tilt by no more than they lie off over its height.
+    So it is where it leans, over the part's height, by no more than its walls may lie off.
     """
     leans_mm = float(np.hypot(*placed.matrix[:2, 2])) * float(np.ptp(template.bounds_mm[:, 2]))
-    stands = placed.matrix[2, 2] > 0.0 and leans_mm < MOVED_MM
+    stands = placed.matrix[2, 2] > 0.0 and leans_mm < off_mm
     if not (stands or is_upright(placed)):
         return placed
     turn_rad = float(np.arctan2(placed.matrix[1, 0], placed.matrix[0, 0]))
