@@ -46,7 +46,7 @@ from amrepair.scans import PROBE
 from amrepair.template import open_template
 from gcode.check import check, policy_of
 from gcode.cli import console
-from gcode.cli.judging import tell_warnings
+from gcode.cli.judging import tell_waits, tell_warnings
 from gcode.cli.options import program_text
 from gcode.cli.owning import job_setup, told_if_for_another
 from gcode.errors import JournalError
@@ -234,6 +234,8 @@ def new_run(
             )
             expected, build_from_template = stood_plate(fields, found)
     tell_warnings(job_file, checked.report)
+    if looks.marked is None:  # else the marks may be such lines
+        tell_waits(job_file, text)
     used = sorted({one.which for one in found})
     copies = () if any(expected is field for field in fields) else found
     if copies or len(fields) > 1:
