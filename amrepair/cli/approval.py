@@ -41,6 +41,8 @@ class Terminal:
                     f"  {one.type}, {one.volume_mm3:.1f} mm³ {one.kind} at X {low[0]:.0f} to "
                     f"{high[0]:.0f}, Y {low[1]:.0f} to {high[1]:.0f} mm: {verdict.reason}."
                 )
+            if not decision.own:
+                console.errors.print(f"  {decision.reason}.")
             for way in decision.ways:
                 console.errors.print(f"  {way.told}")
             return confirmed("Go on all the same (no ends the run)?")

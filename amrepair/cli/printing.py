@@ -52,7 +52,11 @@ def loop(
     ] = None,
     template: Annotated[
         Path | None,
-        typer.Option("--template", help="Fitted template, or a mesh that is fitted now."),
+        typer.Option(
+            "--template",
+            help="Fitted template, or a mesh that is fitted now; or a folder with one of each part "
+            "that the job prints.",
+        ),
     ] = None,
     port: Annotated[
         str | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import InputError
 from amrepair.fleet.desk import Desk
 from amrepair.fleet.shared import SharedDetection
-from amrepair.frames import Transform
+from amrepair.library import template_files
 from amrepair.loop import (
     Approval,
     Decision,
@@ -27,7 +28,7 @@ from amrepair.loop import (
     run_loop,
 )
 from amrepair.loop.calibrate import read_calibration
-from amrepair.loop.locate import is_upright, locate_parts, stood
+from amrepair.loop.locate import Located, is_upright, locate_plate, stood_plate
 from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.options import UNASKED
 from amrepair.loop.pace import layers_at, layers_every
@@ -45,7 +46,7 @@ from amrepair.scans import PROBE
 from amrepair.template import open_template
 from gcode.check import check, policy_of
 from gcode.cli import console
-from gcode.cli.judging import tell_warnings
+from gcode.cli.judging import tell_waits, tell_warnings
 from gcode.cli.options import program_text
 from gcode.cli.owning import job_setup, told_if_for_another
 from gcode.errors import JournalError
@@ -225,15 +226,21 @@ def new_run(
                 leave_heaters=said["leave_heaters"], progress=bars,
             )  # fmt: skip
         with watch("template"):
-            field = open_template(template, progress=bars)
+            files = template_files(template) if template.is_dir() else [template]
+            fields = [open_template(path, progress=bars) for path in files]
         with watch("locate"):
-            placed = locate_parts(
-                job, field, layer_height_mm=setup.process.layer_height_mm, progress=bars
+            found = locate_plate(
+                job, fields, layer_height_mm=setup.process.layer_height_mm, progress=bars
             )
-            expected, build_from_template = stood(field, placed)
+            expected, build_from_template = stood_plate(fields, found)
     tell_warnings(job_file, checked.report)
-    if expected is not field:
-        console.errors.print(_how_it_stands(placed, in_turn=len(job.turns) > 1))
+    if looks.marked is None:  # else the marks may be such lines
+        tell_waits(job_file, text)
+    used = sorted({one.which for one in found})
+    copies = () if any(expected is field for field in fields) else found
+    if copies or len(fields) > 1:
+        names = [files[one.which].name for one in found] if len(fields) > 1 else []
+        console.errors.print(_how_it_stands(found, names, in_turn=len(job.turns) > 1))
     ids = (
         own.keep(out / PROFILES, *named[1:])
         if own is not None
@@ -241,21 +248,28 @@ def new_run(
     )
     setting = Setting.of(
         setup, ids, stops=stops, build_from_template=build_from_template, build_from_scanner=pose,
-        copies=() if expected is field else placed, by_beads=True,
+        copies=[one.pose for one in copies], parts=tuple(used.index(one.which) for one in copies),
+        by_beads=True,
         scan_unit=unit, adaptive=pace, marked=looks.marked,
         limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
     forget(out)
-    keep(out, setting, job.program.text, field)
+    keep(out, setting, job.program.text, *(fields[which] for which in used))
     return Begun(setting, setup, job, expected, stops, folder, checked, Tape(out))
 
 
-def _how_it_stands(placed: tuple[Transform, ...], *, in_turn: bool) -> str:
-    """What a person should know of a template that is not as its file has it."""
-    lying = "" if is_upright(placed[0]) else ", lying in another way than its file has it"
-    if len(placed) == 1:
-        return f"The job prints the part{lying}; it is looked at so."
-    every = f"The job prints {len(placed)} copies of the part{lying}"
+def _how_it_stands(found: Sequence[Located], names: Sequence[str], *, in_turn: bool) -> str:
+    """What a person should know of templates that are not as their files have them."""
+    turned = not all(is_upright(one.pose) for one in found)
+    lying = ", lying in another way than its file has it" if turned else ""
+    if len(set(names)) > 1:
+        each = [f"{names.count(name)} of {name}" for name in dict.fromkeys(names)]
+        every = f"The job prints {', '.join(each[:-1])} and {each[-1]}{lying}"
+    else:
+        part = names[0] if names else "the part"
+        if len(found) == 1:
+            return f"The job prints {part}{lying}; it is looked at so."
+        every = f"The job prints {len(found)} copies of {part}{lying}"
     if in_turn:
         return f"{every}, one after the other; each is looked at up to its own end."
     return f"{every}; all of them are looked at."

@@ -457,7 +457,8 @@ def _why(decision: Decision) -> str:
     """One line on why a run was ended."""
     own = decision.own
     kinds = ", ".join(sorted({v.finding.named for v in own}))
-    reason = own[0].reason if own else decision.situation.beyond or decision.reason
+    beyond = "" if decision.situation.laid_nothing else decision.situation.beyond
+    reason = own[0].reason if own else beyond or decision.reason
     reason = "; ".join([reason, *(way.told for way in decision.ways if way.layer is not None)])
     return f"{decision.action}: {kinds + ': ' if kinds else ''}{reason}"
 

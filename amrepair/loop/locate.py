@@ -6,13 +6,15 @@ It reads the job, not the bed: nothing is measured here.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from amrepair.align import align
 from amrepair.arrays import Box, Mask, Numbers, PlanePoints, Points, Values
@@ -58,6 +60,8 @@ MOST_STRETCH = 0.02  # polypropylene's; more is another scale
 # some slicers reckon with those and some without.
 BEAD_SIDES_RATIO = 0.5 * (1.0 - math.pi / 4.0)
 OFF_LAYERS = 1.5  # walls tell the height to about a layer; a raft has two and more
+FLAT = 0.1  # of a top's or a bottom's normal along the layers: within 6 degrees
+UPRIGHT_SIDE = 0.5  # of a side's normal along Z: steeper than 60 degrees
 UPRIGHT = math.cos(math.radians(0.5))  # walls of a low part tell its tilt to a third of a degree
 
 
@@ -66,11 +70,13 @@ class _Inset:
     """A template shrunk by `depth_mm` (`Template`, as far as an alignment asks it).
 
     Where it is known which way is `up`, along its layers, as slicers lay walls: of a slope that is
-    less across it, by its sine, and of a top nothing.
+    less across it, by its sine. Under a flat top and over a flat bottom it is `high_mm`, half a
+    layer, whatever the wall.
     """
 
     whole: Template
     depth_mm: float
+    high_mm: float
     up: Float[np.ndarray, " 3"] | None = None
 
     @property
@@ -88,7 +94,10 @@ class _Inset:
 
     def distance_and_gradient(self, points_mm: Points) -> tuple[Values, Points]:
         distance, gradient = self.whole.distance_and_gradient(points_mm)
-        return distance + self.depth_mm * self.level(gradient), gradient
+        if self.up is None:
+            return distance + self.depth_mm, gradient
+        level = self.level(gradient)
+        return distance + np.where(level < FLAT, self.high_mm, self.depth_mm * level), gradient
 
     def level(self, gradient: Points) -> Values:
         """(n,) how much of a move along a layer is across each surface."""
@@ -120,15 +129,17 @@ def locate_part(job: Job, template: Template, *, layer_height_mm: float) -> Tran
     return placed[0]
 
 
+class Located(NamedTuple):
+    """One thing that a job prints: which of the templates it is of, and build from template."""
+
+    which: int
+    pose: Transform
+
+
 def locate_parts(
     job: Job, template: Template, *, layer_height_mm: float, progress: Progress = silent
 ) -> tuple[Transform, ...]:
-    """Where the part stands in a job, every copy of it: registered to the job's own beads.
-
-    What is connected as seen from above is one thing, skirts, brims and supports left aside, and
-    in jobs that name no roles what is one layer high beside what is higher. The
-    centre lines of the outer walls lie half a bead inside the part, so they are registered to that
-    level of its field. Of poses that fit alike the part is turned least.
+    """Where the part stands in a job, every copy of it (`locate_plate`).
 
     Returns
     -------
@@ -138,7 +149,36 @@ def locate_parts(
     Raises
     ------
     AlignmentError
-        If walls do not fit the template to half a layer: another part, another scale, or one that
+        As `locate_plate`.
+    """
+    found = locate_plate(job, (template,), layer_height_mm=layer_height_mm, progress=progress)
+    return tuple(one.pose for one in found)
+
+
+def locate_plate(
+    job: Job,
+    templates: Sequence[Template],
+    *,
+    layer_height_mm: float,
+    progress: Progress = silent,
+) -> tuple[Located, ...]:
+    """What a job prints and where: each thing is of one of the templates, by the job's own beads.
+
+    What is connected as seen from above is one thing, skirts, brims and supports left aside, and
+    in jobs that name no roles what is one layer high beside what is higher. The
+    centre lines of the outer walls lie half a bead inside the part, so they are registered to that
+    level of its field. Of poses that fit alike the part is turned least; of templates that fit, the
+    one counts whose walls and the job's leave the least of each other unmet.
+
+    Returns
+    -------
+    tuple of Located
+        In the order in which they are begun.
+
+    Raises
+    ------
+    AlignmentError
+        If walls fit no template to half a layer: another part, another scale, or one that
         stands beside ours.
     """
     beads = job.beads
@@ -146,7 +186,6 @@ def locate_parts(
     outer = ours & of_roles(beads, OUTER_WALLS)
     pick = outer if outer.any() else ours
     half_mm = _half_bead_mm(beads, pick)
-    inset = _Inset(template, half_mm)
     thing = _things(beads.start_mm[ours, :2], beads.end_mm[ours, :2], half_mm)
     if not outer.any():
         higher = _of_what_rises(beads.layer[ours], thing)
@@ -154,28 +193,54 @@ def locate_parts(
         thing = np.unique(thing[higher], return_inverse=True)[1]
         pick = outermost(beads, ours, half_mm)
     count = int(thing.max(initial=-1)) + 1
-    if len(template.solid().decompose()) > 1:  # one part seems to be several things
+    if _seem_several(templates):
         thing[:], count = 0, 1
     of_pick = thing[pick[ours]]
-    found: list[Transform] = []
+    high_mm = 0.5 * float(np.median(beads.height_mm[pick]))
+    insets = [_Inset(template, half_mm, high_mm) for template in templates]
+    found: list[Located] = []
     for k in range(count):
         progress("locate", float(k), float(count))
         walls = _walls(beads, np.flatnonzero(pick)[of_pick == k])
         try:
-            found.append(_place(walls, inset, layer_height_mm, found[0] if found else None))
+            found.append(_place_one_of(walls, insets, layer_height_mm, found))
         except AlignmentError as error:
             if count == 1:
                 raise
-            raise AlignmentError(
-                f"the job prints {count} things apart from each other, and the "
-                f"{_nth(k + 1)} of them does not fit the template ({error}); loop over a job that "
-                "prints copies of one part"
-            ) from error
+            raise _not_of(templates, count, k, error) from error
     progress("locate", float(count), float(count))
     layers = [int(beads.layer[ours][thing == k].min(initial=0)) for k in range(count)]
-    return tuple(
-        _on_foot(_untilted(placed, template), template, _begins_mm(job, layer), layer_height_mm)
-        for placed, layer in zip(found, layers, strict=True)
+    stands = []
+    for (which, placed), layer in zip(found, layers, strict=True):
+        template, begins_mm = templates[which], _begins_mm(job, layer)
+        upright = _untilted(placed, template, 0.5 * layer_height_mm)
+        stands.append(Located(which, _on_foot(upright, template, begins_mm, layer_height_mm)))
+    return tuple(stands)
+
+
+def _seem_several(templates: Sequence[Template]) -> bool:
+    """Whether the only part seems to be several things, as seen from above."""
+    bodies = [len(template.solid().decompose()) for template in templates]
+    if len(bodies) > 1 and max(bodies) > 1:
+        raise AlignmentError(
+            f"the {_nth(int(np.argmax(bodies)) + 1)} of {len(bodies)} templates is of "
+            f"{max(bodies)} bodies that lie apart, and which of a job's things are its own does "
+            "not show; give each body a template of its own, or one template of all that the job "
+            "prints"
+        )
+    return max(bodies) > 1
+
+
+def _not_of(
+    templates: Sequence[Template], count: int, k: int, error: AlignmentError
+) -> AlignmentError:
+    """What is said where one of a job's things is of no template."""
+    things = f"the job prints {count} things apart from each other, and the {_nth(k + 1)} of them"
+    if len(templates) > 1:
+        return AlignmentError(f"{things} fits none of the {len(templates)} templates ({error})")
+    return AlignmentError(
+        f"{things} does not fit the template ({error}); 'amrepair loop' takes a folder of "
+        "templates, one of each part that a job prints"
     )
 
 
@@ -184,9 +249,18 @@ def stood(template: Template, placed: tuple[Transform, ...]) -> tuple[Template, 
 
     One copy that is only turned about Z stays as it is; else the frame is the bed's own.
     """
-    if len(placed) == 1 and is_upright(placed[0]):
-        return template, placed[0]
-    return StoodTemplate.of(template, placed), Transform.identity("build", "template")
+    return stood_plate((template,), tuple(Located(0, pose) for pose in placed))
+
+
+def stood_plate(
+    templates: Sequence[Template], found: Sequence[Located]
+) -> tuple[Template, Transform]:
+    """As `stood`, of all that a job prints."""
+    if len(found) == 1 and is_upright(found[0].pose):
+        return templates[found[0].which], found[0].pose
+    parts = tuple(templates[one.which] for one in found)
+    stands = StoodTemplate.of_parts(parts, tuple(one.pose for one in found))
+    return stands, Transform.identity("build", "template")
 
 
 def is_upright(placed: Transform) -> bool:
@@ -226,6 +300,38 @@ def _walls(beads: Beads, which: Int[np.ndarray, " w"]) -> Scan:
     points, owner = places_along(beads.start_mm[which], beads.end_mm[which], THING_STEP_MM)
     points[:, 2] -= 0.5 * beads.height_mm[which][owner]
     return Scan(points, 0.05, "build", source="the job's walls")
+
+
+def _place_one_of(
+    walls: Scan, insets: Sequence[_Inset], layer_height_mm: float, found: Sequence[Located]
+) -> Located:
+    """Which of the templates walls are of, and where it stands."""
+    fits: list[tuple[float, Located]] = []
+    for k, inset in enumerate(insets):
+        like = next((one.pose for one in found if one.which == k), None)
+        try:
+            placed = Located(k, _place(walls, inset, layer_height_mm, like))
+        except AlignmentError:
+            if len(insets) == 1:
+                raise
+            continue
+        fits.append((_unmet_ratio(walls, inset, placed.pose) if len(insets) > 1 else 0.0, placed))
+    if not fits:
+        raise AlignmentError("its walls lie on those of no template, at their scale")
+    return min(fits, key=lambda fit: fit[0])[1]
+
+
+def _unmet_ratio(walls: Scan, inset: _Inset, placed: Transform) -> float:
+    """The share of a job's walls that are none of a part's, and of the part's that the job lacks.
+
+    A hole more or less is all that some parts differ by.
+    """
+    off_mm = np.abs(inset.distance(placed.inverse().apply(walls.points_mm)))
+    surface, normals = inset.surface_points(THING_STEP_MM)
+    sides = np.abs(placed.rotate(normals)[:, 2]) < UPRIGHT_SIDE
+    apart_mm = cKDTree(walls.points_mm).query(placed.apply(surface[sides]))[0]
+    lacks = apart_mm > THING_STEP_MM
+    return float((off_mm > inset.depth_mm).mean()) + float(lacks.mean() if len(lacks) else 0.0)
 
 
 def _place(walls: Scan, inset: _Inset, layer_height_mm: float, like: Transform | None) -> Transform:
@@ -361,7 +467,9 @@ def walls_moved_mm(job: Job, template: Template, placed: Transform) -> float:
     pick = (beads.layer >= 0) & of_roles(beads, OUTER_WALLS)
     if not pick.any():
         return 0.0
-    inset = _Inset(template, _half_bead_mm(beads, pick))
+    inset = _Inset(
+        template, _half_bead_mm(beads, pick), 0.5 * float(np.median(beads.height_mm[pick]))
+    )
     walls = _Walls(_walls(beads, np.flatnonzero(pick))).told_off(inset, placed)
     return abs(walls.outside_mm) + abs(walls.stretch) * walls.half_mm
 
@@ -381,9 +489,14 @@ def _nth(number: int) -> str:
     return {1: "first", 2: "second", 3: "third"}.get(number, f"{number}th")
 
 
-def _untilted(placed: Transform, template: Template) -> Transform:
-    """The pose turned about Z alone, where it is upright: slicers do not tilt, walls waver."""
-    if not is_upright(placed):
+def _untilted(placed: Transform, template: Template, off_mm: float) -> Transform:
+    """The pose turned about Z alone, where it is upright: slicers do not tilt, walls waver.
+
+    So it is where it leans, over the part's height, by no more than its walls may lie off.
+    """
+    leans_mm = float(np.hypot(*placed.matrix[:2, 2])) * float(np.ptp(template.bounds_mm[:, 2]))
+    stands = placed.matrix[2, 2] > 0.0 and leans_mm < off_mm
+    if not (stands or is_upright(placed)):
         return placed
     turn_rad = float(np.arctan2(placed.matrix[1, 0], placed.matrix[0, 0]))
     turn = rotation_from_vector(np.array([0.0, 0.0, turn_rad]))

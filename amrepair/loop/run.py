@@ -86,12 +86,12 @@ def run_loop(
     ...     stops=plan_stops(job, []),
     ... )
     >>> printer.close()
-    >>> [look.printed for look in report.looks]  # the scan did not change: it tries once
-    [True, False]
+    >>> [look.printed for look in report.looks]  # the scan did not change: nothing rose
+    [True, False, False]
     >>> [str(look.decision.action) for look in report.looks]
-    ['fill now', 'offer to print again']
-    >>> [way.name for way in report.looks[-1].decision.ways]  # of what the nozzle cannot get to
-    ['reprint', 'leave']
+    ['fill now', 'look again', 'pause and ask']
+    >>> report.stopped[:54]  # nobody is there to be asked
+    'pause and ask: nothing rose where the last repair was '
     """
     run = Run(
         job, checked, printer, scanner, site_at, stops=stops,

@@ -51,6 +51,8 @@ class Setting:
     copies
         Where each copy stands, 4×4, where the template that the run looks with is of them
         (`locate.stood`); else empty.
+    parts
+        Of which of the kept templates each copy is; empty where there is one template.
     policy
         What is worth a repair, and how many passes a stop may have.
     limited
@@ -88,6 +90,7 @@ class Setting:
     approve: str = ""
     title: str = "job"
     copies: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    parts: tuple[int, ...] = ()
     leave_heaters: bool = False
     marked: int | None = None
     sound: tuple[Any, ...] = ()
@@ -139,12 +142,13 @@ class Setting:
         """Build from template."""
         return Transform("build", "template", np.array(self.build_from_template))
 
-    def as_it_stands(self, template: Template) -> Template:
-        """What the run looks with: the part's template, or its copies as they stand."""
+    def as_it_stands(self, templates: Sequence[Template]) -> Template:
+        """What the run looks with: the part's template, or all parts as they stand."""
         if not self.copies:
-            return template
+            return templates[0]
         poses = (Transform("build", "template", np.array(rows)) for rows in self.copies)
-        return StoodTemplate.of(template, tuple(poses))
+        which = self.parts or (0,) * len(self.copies)
+        return StoodTemplate.of_parts(tuple(templates[k] for k in which), tuple(poses))
 
     @property
     def scanner_pose(self) -> Transform:
@@ -187,8 +191,8 @@ class Recorded:
         return check(program, self.setup, policy=policy, leave_heaters=leave)
 
 
-def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> None:
-    """Write setting, job and template; whole files.
+def keep(folder: Path, setting: Setting, job_text: str, *templates: Template) -> None:
+    """Write setting, job and templates; whole files.
 
     Raises
     ------
@@ -197,7 +201,8 @@ def keep(folder: Path, setting: Setting, job_text: str, template: Template) -> N
     """
     try:
         write_bytes(folder / JOB, job_text.encode())
-        _keep_template(folder, template)
+        for number, template in enumerate(templates, start=1):
+            _keep_template(folder, template, number)
         said = {"version": RUN_VERSION, **asdict(setting)}
         text = json.dumps(said, indent=2, ensure_ascii=False) + "\n"
         write_bytes(folder / SETTING, text.encode())
@@ -240,26 +245,35 @@ def open_run(folder: Path) -> Recorded:
         if setting.marked is not None
         else plan_stops(job, setting.layers, final=setting.final)
     )
-    template = setting.as_it_stands(_kept_template(folder))
+    template = setting.as_it_stands(
+        [_kept_template(folder, k + 1) for k in range(max(setting.parts, default=0) + 1)]
+    )
     return Recorded(setting, setup, job, template, stops)
 
 
-def _keep_template(folder: Path, template: Template) -> None:
+def _keep_template(folder: Path, template: Template, number: int) -> None:
     """As its own file; an exact mesh, which has none, as its triangles."""
     save: Any = getattr(template, "save", None)
-    (folder / MESH).unlink(missing_ok=True)
+    own, mesh = _numbered(folder / TEMPLATE, number), _numbered(folder / MESH, number)
+    mesh.unlink(missing_ok=True)
     if save is not None:
-        save(folder / TEMPLATE)
+        save(own)
         return
     vertices, faces = mesh_of(template.solid())
-    with (folder / MESH).open("wb") as file:
+    with mesh.open("wb") as file:
         np.savez(file, vertices_mm=vertices, faces=faces)
 
 
-def _kept_template(folder: Path) -> Template:
-    if not (folder / MESH).is_file():
-        return load_template(folder / TEMPLATE)
-    with np.load(folder / MESH) as kept:
+def _numbered(path: Path, number: int) -> Path:
+    """The first template's file has its plain name."""
+    return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+
+
+def _kept_template(folder: Path, number: int) -> Template:
+    own = _numbered(folder / MESH, number)
+    if not own.is_file():
+        return load_template(_numbered(folder / TEMPLATE, number))
+    with np.load(own) as kept:
         mesh = trimesh.Trimesh(kept["vertices_mm"], kept["faces"], process=False)
     return MeshSdf.from_mesh(mesh)
 

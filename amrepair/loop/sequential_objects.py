@@ -112,11 +112,7 @@ def template_of(
     if isinstance(template, StoodTemplate):
         own = [k for k, box in enumerate(template.boxes_mm) if _shares(box, laid)]
         if own:
-            return StoodTemplate(
-                template.part,
-                tuple(template.placed[k] for k in own),
-                tuple(template.boxes_mm[k] for k in own),
-            )
+            return template.some(own)
     else:
         of_whole = template.solid().decompose()
         moved = build_from_template.solid(template.solid())

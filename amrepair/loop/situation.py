@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import manifold3d
+
 from amrepair.loop.buried_defects import (
     buried,
     buried_mm3,
@@ -20,7 +22,7 @@ from amrepair.loop.objects import Objects
 from amrepair.policy import DEFAULT_POLICY, Decision, PolicyOptions, decide, gravest, judge
 from amrepair.policy.acceptance import volume_mm3
 from amrepair.policy.limits import exceeded
-from amrepair.policy.stopping_criteria import is_little, is_stuck
+from amrepair.policy.stopping_criteria import is_laid_nothing, is_little, is_stuck
 from amrepair.policy.table import Action, Situation
 from amrepair.repair import RepairPlan, Site
 from gcode.profiles import ProcessProfile
@@ -63,13 +65,15 @@ def decide_look(
             objects=objects,
         )
     )
+    laid_nothing = _laid_nothing(here, plan, policy)
     left = buried(pieces_of(plan, here), stop, plan.layer_height_mm, policy)
     situation = Situation(
         gravest=gravest(verdicts),
         seen_twice=seen_twice,
         refused=plan.checked is None,
         last_pass=sum(look.printed for look in here) >= policy.most_passes,
-        stuck=_stuck(here, plan, policy),
+        stuck=_stuck(here, plan, policy) and not laid_nothing,
+        laid_nothing=laid_nothing,
         little_left=_done(here, plan, policy),
         beyond="" if limits is None else _beyond(plan, limits),
         buried_mm3=buried_mm3(left),
@@ -89,10 +93,51 @@ def decide_look(
 
 
 def _stuck(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
-    """Whether the last repair at this stop changed next to nothing."""
-    if not here or not here[-1].printed:
+    """Whether the last repair at this stop changed next to nothing of what it was to fill."""
+    repair = _last_repair(here)
+    if repair is None:
         return False
-    return is_stuck(here[-1].plan.deficit.missing_mm3, plan.deficit.missing_mm3, policy)
+    before = repair.deficit.missing
+    return is_stuck(before.volume(), _left_in_place_mm3(before, plan.deficit.missing), policy)
+
+
+def _laid_nothing(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
+    """Whether nothing rose where the last repair at this stop was laid (`is_laid_nothing`)."""
+    repair = _last_repair(here)
+    if repair is None or repair.patch is None:
+        return False
+    before = repair.deficit.missing
+    # what was laid where nothing was missing stands out there
+    stands_mm3, stood_mm3 = (_over_mm3(before, one.deficit.excess) for one in (plan, repair))
+    filled_mm3 = before.volume() - _left_in_place_mm3(before, plan.deficit.missing)
+    risen_mm3 = filled_mm3 + max(stands_mm3 - stood_mm3, 0.0)
+    return is_laid_nothing(before.volume(), repair.patch.reachable_mm3, risen_mm3, policy)
+
+
+def _last_repair(here: Sequence[Look]) -> RepairPlan | None:
+    """The plan that was printed last at this stop; None where none was."""
+    return next((look.plan for look in reversed(here) if look.printed), None)
+
+
+def _over_mm3(missing: manifold3d.Manifold, excess: manifold3d.Manifold) -> float:
+    """How much of what is too much lies over a place where something was missing."""
+    place = missing.project()
+    pieces = (piece for piece in excess.decompose() if (piece.project() ^ place).area() > 0.0)
+    return float(sum(piece.volume() for piece in pieces))
+
+
+def _left_in_place_mm3(before: manifold3d.Manifold, now: manifold3d.Manifold) -> float:
+    """How much of what is missing now was missing there before.
+
+    A later look also sees what an earlier one was not sure of, which no repair has tried to fill.
+    Two scans of one defect differ at its rim, so a piece that mostly lies in what was missing
+    counts whole; any other by what it shares with that.
+    """
+    left_mm3 = 0.0
+    for piece in now.decompose():
+        whole_mm3, shared_mm3 = piece.volume(), (piece ^ before).volume()
+        left_mm3 += whole_mm3 if shared_mm3 > 0.5 * whole_mm3 else shared_mm3
+    return left_mm3
 
 
 def _done(looks: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:

@@ -1,6 +1,7 @@
 """When to stop repairing at a stop of a job.
 
-Another pass is not worth it when the last one changed nearly nothing, or when little is left.
+Another pass is not worth it when the last one changed nearly nothing, or when little is left. Where
+nothing of it came out of the nozzle, neither is the rest of the job.
 """
 
 from __future__ import annotations
@@ -11,6 +12,28 @@ from amrepair.policy.options import DEFAULT_POLICY, PolicyOptions
 def is_stuck(before_mm3: float, left_mm3: float, options: PolicyOptions = DEFAULT_POLICY) -> bool:
     """Whether the last repair left nearly all of what was missing before it."""
     return left_mm3 > options.stuck_ratio * before_mm3
+
+
+def is_laid_nothing(
+    before_mm3: float, laid_mm3: float, risen_mm3: float, options: PolicyOptions = DEFAULT_POLICY
+) -> bool:
+    """Whether nothing of the last repair came out of the nozzle, by its balance.
+
+    Either all that was to be laid has risen, or nothing has: the nozzle is clogged, or the filament
+    out. Two scans of one defect differ by no more than the share by which a repair counts as
+    stuck, so where more than twice that was to be laid, what has risen tells which.
+
+    Parameters
+    ----------
+    before_mm3
+        What was missing before the repair.
+    laid_mm3
+        What of it the repair was to fill.
+    risen_mm3
+        What rose there: of what was missing, and on top of it.
+    """
+    differ_mm3 = (1.0 - options.stuck_ratio) * before_mm3
+    return risen_mm3 < differ_mm3 < laid_mm3 - differ_mm3
 
 
 def is_little(found_mm3: float, left_mm3: float, options: PolicyOptions = DEFAULT_POLICY) -> bool:

@@ -123,6 +123,9 @@ class Situation:
     last_pass, stuck, little_left
         Reasons against another pass: as many as allowed were made; the last one changed little;
         little is left (`stopping_criteria`).
+    laid_nothing
+        Whether nothing rose where the last repair was laid: the nozzle is clogged, or the filament
+        out. Then it is not `stuck`.
     beyond
         Where repairs are printed unasked: the limit of the profile that this one exceeds. Else
         empty.
@@ -137,6 +140,7 @@ class Situation:
     refused: bool = False
     last_pass: bool = False
     stuck: bool = False
+    laid_nothing: bool = False
     little_left: bool = False
     beyond: str = ""
     buried_mm3: float = 0.0
@@ -210,6 +214,7 @@ _QUANTITY_NAMES = {
     "layer_off": "the layer lies off by more than its own scatter",
     "last_pass": "it was the last pass allowed",
     "stuck": "the last pass changed little",
+    "laid_nothing": "nothing rose where the last repair was laid",
     "little_left": "little is left",
     "refused": "nothing of the patch may be printed",
     "gravest": "gravest",
@@ -334,6 +339,11 @@ _FILL = _is("gravest", Action.FILL_NOW)
 STOP_ROWS: tuple[Row, ...] = (
     Row("S1", Action.STOP, (_is("gravest", Action.STOP),),
         "a finding ends the run: parked, heaters off"),
+    Row("S1a", Action.LOOK_AGAIN, (_is("laid_nothing", True), _is("seen_twice", False)),
+        "a false alarm would halt the print"),
+    Row("S1b", Action.PAUSE, (_is("laid_nothing", True),),
+        "nothing rose where the last repair was laid: the nozzle is clogged, or the filament out, "
+        "and the job would be printed into air"),
     Row("S2", Action.PAUSE, (_is("gravest", Action.PAUSE),),
         "a finding needs somebody's word; where nobody can be asked, the run ends parked"),
     Row("S2a", Action.GIVE_UP, (_is("gravest", Action.GIVE_UP),),

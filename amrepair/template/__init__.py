@@ -7,7 +7,7 @@ All kinds answer the same questions (`port.Template`):
 - `MeshSdf`: exact distances to a mesh, without fitting, but slow;
 - `PlannedSdf`: the solid that a job's own beads make;
 - `PaperSdf`: the published neural network, for comparison; only this one imports torch;
-- `CutTemplate`: any of them cut at a layer; `StoodTemplate`: copies of one as they stand on a bed.
+- `CutTemplate`: any of them cut at a layer; `StoodTemplate`: those that stand on a bed.
 
 The room does not know the poses of scans, nor what is done about a difference.
 """

@@ -1,11 +1,12 @@
-"""A template as a job lays it on the bed: in whatever way it lies, and as often as it is printed.
+"""Templates as a job lays them on the bed: in whatever way they lie, as often as it prints them.
 
-What is cut at a layer's height must have its Z upright, and a scan of the bed shows every copy. The
-copies' field is the least of theirs: exact outside and inside, since they do not overlap.
+What is cut at a layer's height must have its Z upright, and a scan of the bed shows all that stands
+there. Their field is the least of theirs: exact outside and inside, since they do not overlap.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,27 +22,45 @@ from gcode.meshes import mesh_of
 
 @dataclass(frozen=True, slots=True)
 class StoodTemplate:
-    """Copies of a part as they stand (`Template`); its frame is the bed's.
+    """Parts as they stand (`Template`), copies of one or several; its frame is the bed's.
 
     Attributes
     ----------
-    part
-        The template of one, in its own frame.
+    parts
+        The template of each that stands there, in its own frame; copies have the same one.
     placed
-        Where each copy stands (build from template).
+        Where each stands (build from template).
     boxes_mm
         (2, 3) box of each as it stands.
     """
 
-    part: Template
+    parts: tuple[Template, ...]
     placed: tuple[Transform, ...]
     boxes_mm: tuple[Box, ...]
 
     @classmethod
     def of(cls, part: Template, placed: tuple[Transform, ...]) -> StoodTemplate:
-        """From the poses; boxes are measured on the part's solid."""
-        vertices = np.asarray(mesh_of(part.solid())[0], dtype=np.float64)
-        return cls(part, placed, tuple(box_of(pose.apply(vertices)) for pose in placed))
+        """Copies of one part, from their poses."""
+        return cls.of_parts((part,) * len(placed), placed)
+
+    @classmethod
+    def of_parts(cls, parts: tuple[Template, ...], placed: tuple[Transform, ...]) -> StoodTemplate:
+        """From the poses; boxes are measured on the parts' solids."""
+        vertices = {
+            id(part): np.asarray(mesh_of(part.solid())[0], dtype=np.float64) for part in parts
+        }
+        boxes = (
+            box_of(pose.apply(vertices[id(part)])) for part, pose in zip(parts, placed, strict=True)
+        )
+        return cls(parts, placed, tuple(boxes))
+
+    def some(self, which: Sequence[int]) -> StoodTemplate:
+        """Only those."""
+        return StoodTemplate(
+            tuple(self.parts[k] for k in which),
+            tuple(self.placed[k] for k in which),
+            tuple(self.boxes_mm[k] for k in which),
+        )
 
     @property
     def bounds_mm(self) -> Box:
@@ -50,8 +69,8 @@ class StoodTemplate:
 
     @property
     def bias_mm(self) -> float:
-        """That of one."""
-        return self.part.bias_mm
+        """The largest of theirs."""
+        return max(part.bias_mm for part in self.parts)
 
     def distance(self, points_mm: Points) -> Values:
         """(n,) signed distance to the nearest copy."""
@@ -61,23 +80,24 @@ class StoodTemplate:
         """(n,) signed distance to the nearest copy, and (n, 3) its gradient."""
         distance, copy = self._nearest(points_mm)
         gradient = np.zeros((len(points_mm), 3))
-        for k, pose in enumerate(self.placed):
+        for k, (part, pose) in enumerate(zip(self.parts, self.placed, strict=True)):
             mine = np.flatnonzero(copy == k)
             if len(mine):
                 own = pose.inverse().apply(points_mm[mine])
-                gradient[mine] = pose.rotate(self.part.distance_and_gradient(own)[1])
+                gradient[mine] = pose.rotate(part.distance_and_gradient(own)[1])
         return distance, gradient
 
     def spread_mm(self, points_mm: Points) -> Values:
         """(n,) standard deviation between normal parts at the nearest copy, where it is known."""
         spread = np.zeros(len(points_mm))
-        known = getattr(self.part, "spread_mm", None)
-        if known is None:
+        known = [getattr(part, "spread_mm", None) for part in self.parts]
+        if not any(known):
             return spread
         copy = self._nearest(points_mm)[1]
-        for k, pose in enumerate(self.placed):
+        for k, (of_part, pose) in enumerate(zip(known, self.placed, strict=True)):
             mine = np.flatnonzero(copy == k)
-            spread[mine] = known(pose.inverse().apply(points_mm[mine]))
+            if of_part is not None:
+                spread[mine] = of_part(pose.inverse().apply(points_mm[mine]))
         return spread
 
     def _nearest(self, points_mm: Points) -> tuple[Values, Numbers]:
@@ -87,12 +107,14 @@ class StoodTemplate:
         """
         distance = np.full(len(points_mm), np.inf)
         copy = np.zeros(len(points_mm), np.int64)
-        for k, (pose, (low, high)) in enumerate(zip(self.placed, self.boxes_mm, strict=True)):
+        for k, (part, pose, (low, high)) in enumerate(
+            zip(self.parts, self.placed, self.boxes_mm, strict=True)
+        ):
             off_mm = np.maximum(np.maximum(low - points_mm, points_mm - high), 0.0)
             ask = np.flatnonzero((off_mm**2).sum(axis=1) < np.maximum(distance, 0.0) ** 2)
             if len(ask) == 0:
                 continue
-            found = self.part.distance(pose.inverse().apply(points_mm[ask]))
+            found = part.distance(pose.inverse().apply(points_mm[ask]))
             nearer = found < distance[ask]
             distance[ask[nearer]], copy[ask[nearer]] = found[nearer], k
         return distance, copy
@@ -100,16 +122,18 @@ class StoodTemplate:
     def surface_points(
         self, spacing_mm: float
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """Points of every copy's surface, and their normals."""
-        points, normals = self.part.surface_points(spacing_mm)
+        """Points of every one's surface, and their normals."""
+        own = {id(part): part.surface_points(spacing_mm) for part in self.parts}
+        each = [(*own[id(k)], pose) for k, pose in zip(self.parts, self.placed, strict=True)]
         return (
-            np.concatenate([pose.apply(points) for pose in self.placed]),
-            np.concatenate([pose.rotate(normals) for pose in self.placed]),
+            np.concatenate([pose.apply(points) for points, _, pose in each]),
+            np.concatenate([pose.rotate(normals) for _, normals, pose in each]),
         )
 
     def solid(self) -> Any:
-        """All copies as one `manifold3d.Manifold`."""
-        one: Any = self.part.solid()
+        """All of them as one `manifold3d.Manifold`."""
+        own: dict[int, Any] = {id(part): part.solid() for part in self.parts}
         return manifold3d.Manifold.batch_boolean(
-            [pose.solid(one) for pose in self.placed], manifold3d.OpType.Add
+            [pose.solid(own[id(k)]) for k, pose in zip(self.parts, self.placed, strict=True)],
+            manifold3d.OpType.Add,
         )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcode.cli import console
-from gcode.cli.judging import LeaveHeatersOption, tell_warnings, warnings_json
+from gcode.cli.judging import LeaveHeatersOption, tell_waits, tell_warnings, warnings_json
 from gcode.cli.options import (
     AsBuiltOption,
     FileArgument,
@@ -105,6 +105,7 @@ def send(
                 leave_heaters=leave_heaters, progress=bars,
             )  # fmt: skip
     tell_warnings(file, checked.report)
+    tell_waits(file, text)
     if chosen.own is None and (other := other_printer(text, file, setup.printer)) is not None:
         console.errors.print(f"{file}: warning: {other}.")
     console.errors.print(f"{file} on {setup.printer.name}: {what_it_does(program, cost.result())}.")

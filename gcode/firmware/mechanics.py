@@ -29,6 +29,8 @@ ARC_SEGMENT_MM = 0.5
 """Chord of an arc (Marlin's MIN_ARC_SEGMENT_MM … MAX_ARC_SEGMENT_MM lie around it)."""
 MAX_EXTRUDE_MM = 200.0
 """EXTRUDE_MAXLENGTH of Marlin."""
+E_DIGIT_MM = 1e-4
+"""Words that say where the extruder is to be are rounded to less."""
 LARGEST = 1e7
 """No number of a command counts for more; nor does it where it is none."""
 MOST_CHORDS = 10_000
@@ -77,6 +79,7 @@ class Mechanics:
         self.laid: Laid | None = None
         self._laid_bytes = 0  # of what was executed and is not forgotten, so much is laid
         self.clogged_moves = 0  # nothing comes out on so many more that extrude
+        self.pulled_mm = 0.0  # filament that was pulled back and not yet pushed again
         self.let_go = 0  # how often moves came after the motors had been let go
 
     def stand(self, surface: HeightField, *, seed: int = 0) -> None:
@@ -195,12 +198,13 @@ class Mechanics:
                 return self._refused("cold", target, de_mm)
             self.replies.append(self.variant.cold)
             pushed_mm = 0.0
-        elif self.clogged_moves > 0 and pushed_mm > 0:
+        elif self.clogged_moves > 0 and pushed_mm > self.pulled_mm + E_DIGIT_MM:
             self.clogged_moves -= 1
-            pushed_mm = 0.0
+            pushed_mm = self.pulled_mm  # so far it meets with no resistance
         elif pushed_mm > MAX_EXTRUDE_MM:
             self.replies.append("echo: too long extrusion prevented")
             pushed_mm = 0.0
+        self.pulled_mm = max(self.pulled_mm - pushed_mm, 0.0)
         self.e += de_mm
         self.native_e += de_mm
         self.x, self.y, self.z = target

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from gcode.check import Policy, check, find_refusals, judge, policy_of
 from gcode.cli.app import app
+from gcode.cli.judging import waits_for_somebody
 from gcode.moves import Program
 from gcode.profiles import load_setup
 
@@ -109,6 +110,19 @@ def test_programs_of_our_own_are_known_by_what_our_writer_leaves_in_them() -> No
     assert policy_of(program(GOOD)) is Policy.DANGER
     named = program(GOOD.replace("; a good program", "; ;AMREPAIR:start in a comment"))
     assert policy_of(named) is Policy.DANGER
+
+
+@pytest.mark.parametrize("pause", ["M0 Click", "m600", " M601", "N7 M25", "M226", "M00", "PAUSE"])
+def test_a_job_that_waits_for_somebody_says_so_before_it_begins(pause: str) -> None:
+    """A loop stood still at an M0 in mid-job, and not a word said why."""
+    text = f"G28\nM104 S0\n{pause} ; colour\nG1 X1\n"
+    assert waits_for_somebody(text) == (
+        f"line 3 ({pause.strip()!r}) waits for somebody at the printer, and nothing is printed "
+        "until then"
+    )
+    assert waits_for_somebody(2 * text).endswith("; 2 lines do")
+    none = "M104 S0\nM01X\nM1000\n;M0\nG1 X1 ; M0\nPAUSE_NEXT\nM117 M0\n"
+    assert waits_for_somebody(none) == ""
 
 
 def test_check_and_send_tell_warnings_and_what_they_add(tmp_path: Path) -> None:

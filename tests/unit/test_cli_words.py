@@ -19,11 +19,12 @@ from rich.console import Console
 
 import gcode
 from amrepair.align.standing import refuse_impossible
-from amrepair.cli.approval import confirmed
+from amrepair.cli.approval import Terminal, confirmed
 from amrepair.cli.options import part_pose
 from amrepair.cli.repairing import pose_of_job
 from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import AlignmentError, AmrepairError, InputError
+from amrepair.policy.table import Action, Situation, decide
 from amrepair.template import MeshSdf
 from gcode.cli import console
 from gcode.cli.app import app as gcode_app
@@ -123,6 +124,15 @@ def test_a_folder_is_no_text(tmp_path: Path) -> None:
 def test_only_yes_is_yes(monkeypatch: pytest.MonkeyPatch, typed: str, meant: bool) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO(typed))
     assert confirmed("Print this repair?") is meant
+
+
+def test_who_is_asked_hears_why_even_where_no_finding_led_to_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    silent = decide((), Situation(Action.FILL_NOW, laid_nothing=True, seen_twice=True))
+    assert Terminal(console.Bars()).to_go_on(silent)
+    assert "the nozzle is clogged" in " ".join(capsys.readouterr().err.split())
 
 
 def test_bars_are_away_while_somebody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -305,6 +305,17 @@ def test_a_fault_takes_a_number(value: str) -> None:
         parse_faults(f"line 3 silence {value}")
 
 
+def test_a_clogged_nozzle_keeps_back_no_more_than_what_was_to_come_out() -> None:
+    # regression: what a retraction had pulled back was kept back, too, so that a clog never ended
+    talk = Talk()
+    talk.say("G28", "M109 S210", "M83", "G1 X5 F3000", "M400")
+    before = len(talk.machine.planner.executed)
+    talk.machine.clogged_moves = 2
+    talk.say("G1 E-5 F1500", "G1 E5", "G1 X10 E1", "G1 E-5", "G1 E6", "G1 X20 E1", "M400")
+    pushed_mm = list(talk.machine.planner.executed[before:])[6::9]
+    assert pushed_mm == pytest.approx([-5.0, 5.0, 0.0, -5.0, 5.0, 1.0])
+
+
 E_MODES = ("M82", "M83", "G90", "G91", "G92 E0", "G1 E2 F300", "G1 X1 E3", "G20", "G21")
 
 

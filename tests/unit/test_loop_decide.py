@@ -5,11 +5,16 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import manifold3d
 import numpy as np
 import pytest
 
 from amrepair.loop.findings import _whole_defects
+from amrepair.loop.situation import _laid_nothing, _stuck
+from amrepair.policy import DEFAULT_POLICY
 from amrepair.policy.table import (
     FINDINGS,
     STOP_ROWS,
@@ -59,6 +64,8 @@ CASES = {
 }
 SITUATIONS = {
     "S1": Situation(Action.STOP),
+    "S1a": Situation(Action.FILL_NOW, laid_nothing=True),
+    "S1b": Situation(Action.FILL_NOW, laid_nothing=True, seen_twice=True),
     "S2": Situation(Action.PAUSE),
     "S2a": Situation(Action.GIVE_UP),
     "S3": Situation(Action.LOOK_AGAIN),
@@ -114,6 +121,88 @@ def test_what_is_not_surely_in_the_heads_way_is_looked_at_twice_before_the_print
     again = replace(unsure, seen_twice=True)
     assert judge(again).action is Action.PAUSE
     assert judge(replace(again, object="lid")).action is Action.GIVE_UP
+
+
+CUBE = manifold3d.Manifold.cube
+
+
+def plan_of(
+    missing: manifold3d.Manifold,
+    *,
+    excess: manifold3d.Manifold | None = None,
+    laid_mm3: float = 0.0,
+) -> Any:
+    """As much of a plan as a repair's balance asks for."""
+    deficit = SimpleNamespace(missing=missing, excess=excess or manifold3d.Manifold())
+    return SimpleNamespace(deficit=deficit, patch=SimpleNamespace(reachable_mm3=laid_mm3))
+
+
+@pytest.mark.parametrize(
+    ("left_at_mm", "size_mm", "tells_stuck"),
+    [
+        # regression: three chips were filled, two skipped lines elsewhere were seen only then, and
+        # "the last pass left most of what it found" left them open
+        ((20.0, 0.0, 0.0), (7.0, 2.0, 0.2), False),
+        ((7.9, 0.0, 0.0), (7.5, 2.0, 0.2), False),  # it goes on beside what was filled
+        ((0.3, 0.1, 0.0), (8.0, 2.0, 0.2), True),  # the same, as another scan has it
+        ((1.0, 0.0, 0.0), (4.0, 2.0, 0.2), False),  # half of it was filled
+    ],
+)
+def test_a_repair_is_stuck_where_it_leaves_what_it_was_to_fill(
+    left_at_mm: tuple[float, float, float],
+    size_mm: tuple[float, float, float],
+    tells_stuck: bool,
+) -> None:
+    last = SimpleNamespace(printed=True, plan=plan_of(CUBE((8.0, 2.0, 0.2))))
+    now = plan_of(CUBE(size_mm).translate(left_at_mm))
+    assert _stuck([last], now, DEFAULT_POLICY) is tells_stuck  # type: ignore[list-item]
+
+
+GROOVE_MM3 = 8.0 * 2.0 * 0.2
+
+
+@pytest.mark.parametrize(
+    ("filled_ratio", "left_mm", "on_top_mm", "tells"),
+    [
+        # regression: a clogged nozzle laid nothing, "it has met something else than a defect" was
+        # told, and the job's next five layers were printed into air
+        (0.97, 8.0, 0.0, True),
+        (0.97, 7.0, 0.0, True),  # as another scan has it
+        (0.97, 4.0, 0.0, False),  # half of it came out
+        (0.97, 8.0, 0.2, False),  # it lies on top: nothing was missing there
+        (0.3, 8.0, 0.0, False),  # two scans differ by as much as was to come out
+    ],
+)
+def test_a_repair_of_which_nothing_rose_is_known_by_its_balance(
+    filled_ratio: float, left_mm: float, on_top_mm: float, *, tells: bool
+) -> None:
+    # what stands out elsewhere tells nothing of this place
+    elsewhere = CUBE((9.0, 3.0, 0.3)).translate((40.0, 0.0, 0.0))
+    on_top = CUBE((8.0, 2.0, on_top_mm)).translate((0.0, 0.0, 0.2)) + elsewhere
+    before = plan_of(CUBE((8.0, 2.0, 0.2)), laid_mm3=filled_ratio * GROOVE_MM3)
+    looks: list[Any] = [SimpleNamespace(printed=True, plan=before)]
+    now = plan_of(CUBE((left_mm, 2.0, 0.2)), excess=on_top)
+    assert _laid_nothing(looks, now, DEFAULT_POLICY) is tells
+    # a second look at what the same repair has left tells the same
+    looks.append(SimpleNamespace(printed=False, plan=now))
+    assert _laid_nothing(looks, now, DEFAULT_POLICY) is tells
+
+
+def test_where_nothing_was_printed_yet_no_repair_has_failed() -> None:
+    now = plan_of(CUBE((8.0, 2.0, 0.2)))
+    looks: list[Any] = [SimpleNamespace(printed=False, plan=now)]
+    assert not _laid_nothing([], now, DEFAULT_POLICY)
+    assert not _laid_nothing(looks, now, DEFAULT_POLICY)
+
+
+def test_nothing_is_printed_on_after_a_repair_of_which_nothing_rose() -> None:
+    # whatever the findings are told to be by then: too few, too small, too doubtful
+    for action in (Action.FILL_NOW, Action.FILL_WITH_NEXT, Action.GIVE_UP, Action.GO_ON):
+        once = Situation(action, laid_nothing=True, little_left=True, last_pass=True)
+        assert decide((), once).action is Action.LOOK_AGAIN
+        said = decide((), replace(once, seen_twice=True))
+        assert said.action is Action.PAUSE
+        assert "clogged" in said.told[0]
 
 
 def test_a_speck_in_the_heads_way_does_not_end_a_print() -> None:

@@ -21,7 +21,9 @@ from amrepair.loop.locate import (
     is_upright,
     locate_part,
     locate_parts,
+    locate_plate,
     stood,
+    stood_plate,
     tops_of,
     walls_moved_mm,
 )
@@ -175,6 +177,58 @@ def test_another_thing_beside_the_part_is_refused_with_its_number() -> None:
     template = MeshSdf.from_mesh(solid_mesh(wedge()))
     with pytest.raises(AlignmentError, match=r"2 things apart .*(first|second) of them"):
         locate_parts(job_of(plate), template, layer_height_mm=LAYER_MM)
+
+
+def hooked(holed: bool) -> m3.Manifold:
+    """A plate that is told from its twin by a hole alone."""
+    whole = m3.Manifold.cube((12.0, 9.0, 2.0)) - m3.Manifold.cube((6.0, 4.0, 9.0))
+    return whole - m3.Manifold.cylinder(9.0, 1.5, 1.5, 24).translate(
+        (9.0, 5.0, -1.0 if holed else 5.0)
+    )
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_each_thing_of_a_plate_is_of_the_template_that_it_fits(order: tuple[int, int]) -> None:
+    """A job of two parts was refused: "loop over a job that prints copies of one part"."""
+    parts = [hooked(holed=True), hooked(holed=False)]
+    templates = [MeshSdf.from_mesh(solid_mesh(parts[k])) for k in order]
+    places = [(60.0, 60.0), (80.0, 60.0), (60.0, 80.0)]  # the second part twice
+    plate = m3.Manifold.batch_boolean(
+        [parts[k].translate((*at, 0.0)) for k, at in zip((0, 1, 1), places, strict=True)],
+        m3.OpType.Add,
+    )
+    found = locate_plate(job_of(plate), templates, layer_height_mm=LAYER_MM)
+    told = {tuple(np.round(one.pose.translation_mm[:2])): order[one.which] for one in found}
+    assert told == dict(zip(places, (0, 1, 1), strict=True))
+    template, placed = stood_plate(templates, found)
+    corners = np.concatenate([np.asarray(solid_mesh(plate).vertices)])
+    assert np.abs(template.distance(placed.inverse().apply(corners))).max() < 0.06
+    assert template.solid().volume() == pytest.approx(plate.volume(), rel=1e-3)
+
+
+def test_a_low_part_is_found_upright_whatever_its_tops_and_bottoms_hide() -> None:
+    """A washer of 0.4 mm was refused: its walls lie nearer to a flat than half a bead, and were
+    held to lie 0.1 mm off. Of plates of 0.4 and 2 mm the walls told a tilt of 0.8 degrees.
+    """
+    washer = m3.Manifold.cylinder(0.4, 3.8, 3.8, 64) - m3.Manifold.cylinder(3.0, 1.75, 1.75, 64)
+    plate = hooked(holed=False)
+    for part in (washer, plate, plate.scale((1.0, 1.0, 0.2))):
+        template = MeshSdf.from_mesh(solid_mesh(part))
+        job = job_of(part.translate((80.0, 60.0, 0.0)))
+        placed = locate_part(job, template, layer_height_mm=LAYER_MM)
+        assert placed.rotation[2, 2] == 1.0
+        assert placed.translation_mm == pytest.approx([80.0, 60.0, 0.0], abs=0.05)
+
+
+def test_a_thing_that_is_of_no_template_is_told() -> None:
+    other = hooked(holed=True).translate((60.0, 60.0, 0.0))
+    block = m3.Manifold.cylinder(6.0, 4.0, 3.0, 40).translate((84.0, 64.0, 0.0))
+    templates = [MeshSdf.from_mesh(solid_mesh(hooked(holed=k))) for k in (True, False)]
+    with pytest.raises(AlignmentError, match=r"2 things apart .* of them fits none of the 2"):
+        locate_plate(job_of(other + block), templates, layer_height_mm=LAYER_MM)
+    two = [templates[0], MeshSdf.from_mesh(solid_mesh(other + block))]
+    with pytest.raises(AlignmentError, match="second of 2 templates is of 2 bodies"):
+        locate_plate(job_of(other + block), two, layer_height_mm=LAYER_MM)
 
 
 def test_a_pit_in_the_second_copy_is_found_there() -> None:

@@ -87,7 +87,7 @@ def test_the_pace_begins_anew_with_every_object(three: InTurn) -> None:
 
 
 def test_every_copy_is_found_where_its_turn_prints_it(three: InTurn) -> None:
-    part = getattr(three.template, "part")  # noqa: B009 - of the port nobody knows it
+    (part, *_) = getattr(three.template, "parts")  # noqa: B009 - of the port nobody knows it
     placed = locate_parts(three.job, part, layer_height_mm=0.2)
     low = [pose.apply(np.zeros((1, 3)))[0] for pose in placed]
     wanted = [[tower.x_mm, tower.y_mm, 0.0] for tower in three.towers]
