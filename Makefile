@@ -39,7 +39,7 @@ lint: $(STAMP)
 suite: $(EXTRAS)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope
 
-slow: $(EXTRAS) ## the tests that take longer than a minute, and further draws of those that draw
+slow: $(EXTRAS) ## the tests that are too dear for every run, and further draws of those that draw
 	$(BIN)/python -m pytest -m slow
 
 chromium: $(EXTRAS) ## report, live view and the fleet's page as a person sees and drives them

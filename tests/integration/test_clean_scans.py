@@ -74,6 +74,7 @@ def _has_no_region(path: Path, seed: int) -> None:
         assert detect(_scan(_mesh(solid - tool), seed), template).regions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PARTS, ids=lambda path: path.stem)
 def test_a_clean_part_in_layers_has_no_region(path: Path) -> None:
     _has_no_region(path, 0)

@@ -71,7 +71,7 @@ def test_a_bad_part_is_refused_in_one_sentence(
     "name",
     [
         "empty.stl",
-        "soup.stl",
+        pytest.param("soup.stl", marks=pytest.mark.slow),
         pytest.param("busted.STL", marks=pytest.mark.slow),
         pytest.param("wallhole.obj", marks=pytest.mark.slow),
     ],

@@ -96,6 +96,7 @@ CASES: dict[str, Callable[[str, Path], None]] = {
 }
 NEEDS = {"02_template_from_scans": "amrepair.merge", "05_octoprint": "gcode.hosts.octoprint"}
 SLOW = {
+    "01_offline_repair",
     "02_template_from_scans",
     "03_layerwise_loop",
     "04_real_printer_over_serial",

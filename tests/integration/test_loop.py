@@ -146,6 +146,7 @@ def test_a_clean_print_is_left_alone(plate: MeshSdf, process: str) -> None:
     assert len(run.report.looks) == 2  # one on the way, one at the end
 
 
+@pytest.mark.slow
 def test_a_void_in_sparse_infill_is_mended_and_its_cells_are_left_open(template: MeshSdf) -> None:
     run = simulate_run(
         prepared(template, "void:diameter=6,layers=3,layer=8", process="standard_0.20")
@@ -231,6 +232,7 @@ def test_the_part_is_found_in_its_job(sound: PreparedRun, template: MeshSdf) -> 
     assert np.abs(placed.apply(corners) - truth).max() < 0.03
 
 
+@pytest.mark.slow
 def test_another_part_is_not_found_in_the_job(sound: PreparedRun) -> None:
     other = MeshSdf.from_mesh(trimesh.creation.box((30.0, 18.0, 6.0)))
     with pytest.raises(AlignmentError):

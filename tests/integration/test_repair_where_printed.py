@@ -43,7 +43,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "job.gcode").write_text(job_text())
     analytic.to_trimesh(BLOCK).export(folder / "part.stl")
     sensors = np.array([[0.0, 0.0, 300.0], [200.0, 200.0, 300.0], [100.0, 97.0, 300.0]])
-    bed = m3.Manifold.cube((80.0, 60.0, 1.0)).translate((70.0, 70.0, -1.0))
+    bed = m3.Manifold.cube((54.0, 36.0, 1.0)).translate((83.0, 81.0, -1.0))
     stands = m3.Manifold.batch_boolean([BLOCK - CORNER, WALL, bed], m3.OpType.Add)
     points, _ = analytic.ray_scan(stands, sensors, spacing_mm=0.25, sigma_mm=0.03, seed=1)
     np.savetxt(folder / "scan.xyz", points, fmt="%.4f")

@@ -120,7 +120,7 @@ def judge(made: Resumption, job: Program, setup: PrintSetup) -> Ran:
 @pytest.mark.parametrize(
     ("name", "printer", "layer"),
     [
-        ("plant-sign", "generic_marlin", 9),
+        pytest.param("plant-sign", "generic_marlin", 9, marks=pytest.mark.slow),
         ("prusaslicer-cube", "prusa_mk3s", 37),
         pytest.param("prusaslicer-cube", "generic_reprap", 60, marks=pytest.mark.slow),
         pytest.param("screw", "generic_marlin", 110, marks=pytest.mark.slow),

@@ -24,7 +24,7 @@ MIDDLE_MM, HIGH_MM = 75.0, 6.0
 
 def sloped(slope_deg: float) -> m3.Manifold:
     """A block whose top rises along x."""
-    block = m3.Manifold.cube((40.0, 40.0, 40.0)).translate((55.0, 55.0, 0.0))
+    block = m3.Manifold.cube((26.0, 24.0, 40.0)).translate((62.0, 63.0, 0.0))
     slope = float(np.radians(slope_deg))
     normal = (float(np.sin(slope)), 0.0, -float(np.cos(slope)))
     return block.trim_by_plane(normal, MIDDLE_MM * normal[0] + HIGH_MM * normal[2])

@@ -89,7 +89,7 @@ def fault_scripts(kinds: tuple[str, ...]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(
     lines=programs(),
     faults=fault_scripts(MENDABLE),
@@ -106,7 +106,7 @@ def test_every_command_runs_once_and_in_order(
     assert talk.program == lines
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(
     lines=programs(),
     faults=fault_scripts(MENDABLE),

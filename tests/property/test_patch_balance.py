@@ -35,7 +35,7 @@ NOTCH = Solid.cube((14.0, 10.0, 20.0)).translate((8.0, -1.0, 7.0))
 CASES = {
     # regression: told twice, each pass its own "thinner than half a nozzle" beside what stayed open
     "star with thin walls": (hollow(5, 12.0, 1.0), above(3.0)),
-    "cup of two lines": (hollow(96, 9.0, 0.8), above(4.0)),
+    "cup of two lines": (hollow(48, 5.0, 0.8), above(4.0)),
     # regression: the ring's box holds the pit, of which it told a share as its own
     "pit in a ring": (
         BLOCK + Solid.cube((30.0, 24.0, 3.0)).translate((0.0, 0.0, 10.0)),

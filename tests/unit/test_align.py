@@ -189,6 +189,7 @@ def test_another_part_is_refused(template: MeshSdf) -> None:
         align(Scan(np.asarray(ball.vertices), 0.03, "scanner"), template)
 
 
+@pytest.mark.slow
 def test_a_part_far_from_its_guess_is_refused(template: MeshSdf) -> None:
     points = cloud(template, sigma_mm=0.03, seed=0)
     far = pose(4, turn_rad=0.0, shift_mm=9.0)

@@ -30,6 +30,7 @@ from tests.analytic import (
     to_trimesh,
     union,
 )
+from tests.draws import draws
 
 SIGMA_MM = 0.04
 Points = Float[np.ndarray, "n 3"]
@@ -74,7 +75,10 @@ def another_piece(rng: np.random.Generator, count: int) -> Points:
 
 
 @pytest.mark.parametrize(
-    ("clutter", "share"), [(scattered, 0.43), (bed, 2.5), (another_piece, 0.43)]
+    ("clutter", "share"),
+    draws(
+        [(scattered, 0.43), (bed, 2.5), (another_piece, 0.43)], (another_piece, 0.43), (bed, 2.5)
+    ),
 )
 def test_the_part_is_found_in_what_surrounds_it(clutter: object, share: float) -> None:
     assert callable(clutter)
@@ -173,6 +177,7 @@ def test_the_other_hand_is_refused() -> None:
         aligned(stepped(), part * (-1.0, 1.0, 1.0), part[:0])
 
 
+@pytest.mark.slow
 def test_another_part_is_not_called_a_mirror_image(monkeypatch: pytest.MonkeyPatch) -> None:
     # regression: so was a small part of which three quarters fitted a flat side when mirrored
     module = importlib.import_module("amrepair.align.align")

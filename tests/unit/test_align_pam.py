@@ -120,6 +120,7 @@ def test_the_pose_does_not_depend_on_scale_or_frame(template: MeshSdf) -> None:
     assert two.loss == pytest.approx(one.loss)
 
 
+@pytest.mark.slow
 def test_another_part_is_refused(template: MeshSdf) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=30.0)
     with pytest.raises(AlignmentError):

@@ -151,6 +151,7 @@ def test_a_piece_of_a_long_part_is_found_wherever_it_lies() -> None:
     assert not found.symmetric_alternatives
 
 
+@pytest.mark.slow
 def test_a_corner_of_a_part_is_found_wherever_it_lies() -> None:
     # regression: with four places for each rotation none of these three searches found it
     part = MeshSdf.from_mesh(load_mesh(part_path("bracket")))

@@ -317,6 +317,7 @@ def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
         read_entries(str(tmp_path / "none"))
 
 
+@pytest.mark.slow
 def test_another_part_is_a_row_with_its_sentence(ready: Path, tmp_path: Path) -> None:
     import trimesh
 
@@ -334,6 +335,7 @@ def test_another_part_is_a_row_with_its_sentence(ready: Path, tmp_path: Path) ->
     assert "ball.ply" in report.rows[1]["sentence"]
 
 
+@pytest.mark.slow
 def test_mixed_parts_are_told_apart_and_what_fits_none_is_a_row(
     ready: Path, tmp_path: Path
 ) -> None:

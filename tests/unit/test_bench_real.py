@@ -159,7 +159,7 @@ def test_memory_is_the_childs_own(bench: ModuleType) -> None:
 def test_baseline_finds_a_dent_and_nothing_else(bench: ModuleType, scans: ModuleType) -> None:
     small = 15.0 / RADIUS_MM
     surface = scans.Surface(trimesh.creation.icosphere(4, 15.0))
-    points = ball_points(np.random.default_rng(1)) * small
+    points = ball_points(np.random.default_rng(1), 30_000) * small
     way = points / np.linalg.norm(points, axis=1, keepdims=True)
     in_dent = way[:, 2] > np.cos(0.3)  # 4.5 mm round
     site, _ = bench.baseline_regions(surface, points, 0.15)

@@ -16,6 +16,7 @@ from amrepair.bench.synth_defects import Part, Size, SynthDefect, damage, make_p
 from amrepair.bench.synth_views import Rays, look, sample_shape, sensor_towards, sensors_around
 from amrepair.errors import InputError
 from gcode.solids import as_manifold
+from tests.draws import draws
 
 SIZE_MM = np.array([60.0, 40.0, 20.0])
 SMALL = SynthOptions(train=2, normal=2, per_defect=1, points=3000)
@@ -118,7 +119,7 @@ def test_noise_and_density_are_as_asked(box: Part) -> None:
     assert counts.max() < 5 * counts.min()  # uneven, within the stated e^1.5
 
 
-@pytest.mark.parametrize("layout", ["anomaly-shapenet", "real3d-ad"])
+@pytest.mark.parametrize("layout", draws(["anomaly-shapenet", "real3d-ad"], "anomaly-shapenet"))
 def test_a_data_set_reads_back_with_poses_undone(
     box_file: Path, tmp_path: Path, layout: str
 ) -> None:

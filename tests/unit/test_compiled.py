@@ -15,6 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core.bytecode import FunctionIdentity
 from numba.core.caching import IndexDataCacheFile
 from numba.core.errors import TypingError
 from numba.extending import overload
@@ -77,9 +78,25 @@ for _ in range({skip}):
 def kernel(values):
     return np.{function}(values)
 """
+
+
+def test_each_process_numbers_what_it_compiles_from_a_place_of_its_own() -> None:
+    """Of processes whose places are neighbours two mix their sorts, as a slow test shows."""
+    numbers = FunctionIdentity._unique_ids
+    try:
+        places = [next(numbers)]
+        for _ in range(20):
+            compiled.count_from_own_place()
+            places.append(next(FunctionIdentity._unique_ids))
+    finally:
+        FunctionIdentity._unique_ids = numbers
+    assert np.diff(sorted(places)).min() > 10_000  # as many as a process makes of all kernels
+
+
 PARTS = re.compile(rb"13run_quicksortB\d+v(\d+)B")
 
 
+@pytest.mark.slow
 def test_kernels_that_two_processes_compiled_do_not_mix_their_parts(tmp_path: Path) -> None:
     """regression: a tree of triangles crashed where another process had compiled another sort."""
     outside = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}

@@ -54,6 +54,7 @@ def deficit_of(template: MeshSdf, standing: m3.Manifold, seed: int = 0) -> Defic
     )
 
 
+@pytest.mark.slow
 def test_a_layer_too_low_is_missing_by_its_depth_and_no_more_beside_walls(
     template: MeshSdf,
 ) -> None:

@@ -82,7 +82,7 @@ def found_ratio(scan: Scan, wall_mm: float, gone: m3.Manifold) -> float:
             for w in (0.8, 1.2, 1.6)
             if (p, w) != ("rim", 0.8)
         ),
-        *(("notch", 1.2), ("rim", 1.6), ("bite", 1.2), ("deep", 0.8)),
+        *(("notch", 1.2), ("deep", 0.8)),
     ),  # 0.6 mm off 0.8 mm, at cells of 0.7 mm: the noise says whether
 )
 def test_what_a_thin_wall_lost_is_found_by_the_rays_that_passed(piece: str, wall_mm: float) -> None:
@@ -93,9 +93,7 @@ def test_what_a_thin_wall_lost_is_found_by_the_rays_that_passed(piece: str, wall
 
 @pytest.mark.parametrize(
     ("piece", "wall_mm"),
-    draws(
-        itertools.product(("notch", "deep"), (0.45, 0.8, 1.2, 1.6)), ("notch", 0.45), ("deep", 0.8)
-    ),
+    draws(itertools.product(("notch", "deep"), (0.45, 0.8, 1.2, 1.6)), ("notch", 0.45)),
 )
 def test_without_sensors_it_is_found_by_the_end_across_the_wall(piece: str, wall_mm: float) -> None:
     """Regression: of walls of 0.45 and 0.8 mm all that had broken off was said to be there."""
@@ -109,6 +107,7 @@ def test_an_end_is_no_neighbour_of_the_cells_beside_it() -> None:
     assert found_ratio(bare(seen(tube(1.6) - gone)), 1.6, gone) > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 0, 3])
 def test_of_a_cup_of_one_bead_s_wall_the_upper_half_is_found_all_around(seed: int) -> None:
     """Where chance left a gap in the scanned end a wedge was left standing over it (0.91 found,

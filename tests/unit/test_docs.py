@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import runpy
@@ -48,6 +49,12 @@ def typed(page: Path) -> list[str]:
     return [line for line in text.splitlines() if line.split(" ")[0] in APPS]
 
 
+@functools.cache
+def program(name: str) -> click.Command:
+    """A program with all its commands: a twentieth of a second to put together."""
+    return typer.main.get_command(APPS[name])
+
+
 SHELL = [(page, line) for page in (*PAGES, ROOT / "README.md") for line in typed(page)]
 
 
@@ -56,7 +63,7 @@ SHELL = [(page, line) for page in (*PAGES, ROOT / "README.md") for line in typed
 )
 def test_what_is_typed_is_understood(page: Path, line: str) -> None:
     words = shlex.split(line, comments=True)
-    command: click.Command = typer.main.get_command(APPS[words[0]])
+    command = program(words[0])
     rest = words[1:]
     while getattr(command, "commands", None):
         command = command.commands[rest.pop(0)]  # type: ignore[attr-defined]

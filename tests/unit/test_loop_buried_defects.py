@@ -243,6 +243,7 @@ def test_of_a_finished_part_whose_layers_lie_aside_the_first_is_told(
     assert "--layer 9" in told
 
 
+@pytest.mark.slow
 def test_a_part_that_was_moved_cannot_be_printed_again_from_a_layer_on(
     hollowed: tuple[Small, Stop, m3.Manifold], job_file: Path
 ) -> None:

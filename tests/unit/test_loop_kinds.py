@@ -29,6 +29,7 @@ from gcode.profiles import load_setup
 from gcode.reader import read_job
 from gcode.stretches import places_along
 from gcode.surfaces import HeightField
+from tests.draws import draws
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "bench_kinds.py"
 
@@ -76,7 +77,9 @@ def types_in(  # type: ignore[no-untyped-def]
     return found
 
 
-@pytest.mark.parametrize("kind", ["void", "missing_beads", "layer_shift", "string"])
+@pytest.mark.parametrize(
+    "kind", draws(["void", "missing_beads", "layer_shift", "string"], "missing_beads", "string")
+)
 def test_a_defect_is_told_by_its_surface(bench: ModuleType, scene, kind: str) -> None:  # type: ignore[no-untyped-def]
     found = types_in(planned(bench, scene, kind, 0), scene)
     assert max(found, key=found.__getitem__) == kind

@@ -112,6 +112,7 @@ def test_a_part_sliced_lying_in_another_way_is_expected_as_it_lies(
     assert np.abs(CutTemplate(expected, 3.0).distance(np.asarray(points))).max() < 0.15
 
 
+@pytest.mark.slow
 def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
     truths = [pose((0.0, 0.0, turn), x, y) for turn, x, y in
               ((0.0, 60.0, 60.0), (0.0, 81.0, 60.0), (90.0, 60.0, 80.0))]  # fmt: skip
@@ -272,6 +273,7 @@ def test_the_field_of_copies_is_the_least_of_theirs() -> None:
     assert stands.solid().volume() == pytest.approx(2 * wedge().volume(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_skirt_is_nothing_too_much() -> None:
     """At the finished part, which its template judges, 0.6 mm of skirt was too much."""
     truth = pose((0.0, 0.0, 0.0), 60.0, 60.0)
@@ -330,7 +332,7 @@ def test_a_part_on_a_raft_stands_where_its_beads_begin() -> None:
     for stop in stops:
         so_far = part.trim_by_plane((0.0, 0.0, -1.0), -stop.z_mm)
         pit = m3.Manifold.cube((3.0, 3.0, 2.0), True).translate((64.0, 64.0, stop.z_mm))
-        for gone in (m3.Manifold(), pit):
+        for gone in (m3.Manifold(),) if stop.layer_index is None else (pit,):
             points, who = analytic.ray_scan(
                 (so_far - gone) + raft + bed, sensors, spacing_mm=0.25, sigma_mm=0.03, seed=5
             )
@@ -342,7 +344,8 @@ def test_a_part_on_a_raft_stands_where_its_beads_begin() -> None:
             assert not plan.too_much
 
 
-def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much() -> None:
+@pytest.mark.parametrize("seeds", draws([range(4, 5), range(4, 7)], range(4, 5)), ids=len)
+def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much(seeds: range) -> None:
     """A clean job of PrusaSlicer ended with 37 mm³ too much: its tops lay 0.05 mm over the drawing.
 
     Ridges of 0.1 mm came on top, which alone are allowed for.
@@ -374,7 +377,7 @@ def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much() -> None:
     assert not found(high(5.32), laid=True)
     # beside a blob the ridges are none, either: 9 to 38 mm³ in up to eleven pieces, before
     blob = m3.Manifold.cube((4.0, 4.0, 1.0)).translate((64.0, 64.0, 4.6))
-    for seed in (4, 5, 6):
+    for seed in seeds:
         (much,) = found(high(5.3) + blob, laid=True, seed=seed)
         assert much.label is Label.EXCESS
         # half a cell's width of the ridges around it, 0.18 mm high, hangs together with it
@@ -422,6 +425,7 @@ def test_a_job_whose_walls_are_moved_is_the_part_s(moved_mm: float) -> None:
     assert (final.planned is not None) == (moved_mm != 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved_mm", draws([0.0, -0.1], 0.0))
 def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) -> None:
     """regression: a dome's were told moved by 0.1 mm, and its flanks not looked at in the end."""

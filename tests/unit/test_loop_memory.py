@@ -34,6 +34,7 @@ def test_a_clean_look_keeps_few_points_and_can_still_be_drawn(
     assert np.isclose(height, small.top_mm, atol=0.1).mean() > 0.1  # the part, amid its bed
 
 
+@pytest.mark.slow
 def test_what_was_found_is_kept_as_it_was_decided(small: Small, tmp_path: Path) -> None:
     broken = small.standing - small.block(-0.8, 0.2)
     report, lines = small.run(tmp_path, lambda n: scan_of(broken if n == 1 else small.standing, n))

@@ -12,8 +12,10 @@ from amrepair.errors import ScannerError
 from amrepair.frames import Transform
 from amrepair.loop import Action, Tape
 from amrepair.loop.tape import read_events
+from amrepair.policy.limits import exceeded
 from amrepair.scans import Scan
 from gcode.moves import Program
+from gcode.profiles import load_setup
 from gcode.reader import read_job
 
 
@@ -102,10 +104,27 @@ def test_somebody_may_say_go_on(small: Small, tmp_path: Path) -> None:
     assert to_its_end(small, sent)
 
 
+LIMITS = [(5.0, 1e4, 0.0), (1e4, 1.0, 0.0), (1e4, 1e4, 0.999)]  # of volume, time, reach
+
+
 @pytest.mark.parametrize(
-    "limits", [(5.0, 1e4, 0.0), (1e4, 1.0, 0.0), (1e4, 1e4, 0.999)],
+    ("limits", "said"),
+    list(zip(LIMITS, ["is missing", "takes", "the nozzle reaches"], strict=True)),
+)
+def test_each_limit_of_a_profile_is_told(limits: tuple[float, float, float], said: str) -> None:
+    names = ("unasked_max_mm3", "unasked_max_s", "unasked_min_reachable_ratio")
+    told = load_setup().process.model_copy(update=dict(zip(names, limits, strict=True)))
+    found = exceeded(told, missing_mm3=30.0, print_time_s=60.0, unreachable_mm3=3.0)
+    assert said in found
+    assert "the profile" in found
+    assert exceeded(told, missing_mm3=4.0, print_time_s=0.5, unreachable_mm3=0.0) == ""
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [*(pytest.param(limits, marks=pytest.mark.slow) for limits in LIMITS[:2]), LIMITS[2]],
     ids=["volume", "time", "reach"],
-)  # fmt: skip
+)
 def test_unasked_only_within_the_profile_s_limits(
     small: Small, tmp_path: Path, limits: tuple[float, float, float]
 ) -> None:

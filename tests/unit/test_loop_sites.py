@@ -21,6 +21,7 @@ from gcode.reader import Job, job_for
 from gcode.slicing.job import plan_part
 from gcode.writer import write
 from tests import analytic
+from tests.draws import draws
 
 SETUP = load_setup(process="repair_0.20")
 HERE = Transform.identity("build", "template")
@@ -214,8 +215,9 @@ def test_what_supports_show_is_not_too_much_at_the_final_look() -> None:
     assert looked_at(job, printed).deficit.excess_mm3 < 0.1
 
 
-@pytest.mark.parametrize("blob", BLOBS.values(), ids=list(BLOBS))
-def test_what_is_too_much_is_told_beside_supports(blob: m3.Manifold) -> None:
+@pytest.mark.parametrize("beside", draws(BLOBS, "on a wall beside it"))
+def test_what_is_too_much_is_told_beside_supports(beside: str) -> None:
+    blob = BLOBS[beside]
     job, printed = beside_a_support()
     excess = looked_at(job, printed + blob).deficit.excess
     stands_mm3 = (blob - BLOCK).volume()

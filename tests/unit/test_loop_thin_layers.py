@@ -8,6 +8,8 @@ import manifold3d as m3
 import numpy as np
 import pytest
 
+from amrepair.errors import AlignmentError
+from amrepair.frames import Transform
 from amrepair.loop import Stop
 from amrepair.loop.afterwards import afterwards
 from amrepair.loop.looks import Look, left_well
@@ -171,10 +173,19 @@ def test_the_floor_of_a_large_notch_is_no_thin_layer(small: Small, last: Look) -
     assert with_covered(seen, small.job, site.expected, stop).covered is None
 
 
-def test_a_job_of_another_part_is_told_and_asked_for_nothing(small: Small, last: Look) -> None:
+@pytest.mark.parametrize("looked_for", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_job_of_another_part_is_told_and_asked_for_nothing(
+    small: Small, last: Look, monkeypatch: pytest.MonkeyPatch, looked_for: bool
+) -> None:
     # regression: a mount was repaired with --job of another part, 6 mm high, without a word
     plan = replace(last.plan, covered=None)
     other = MeshSdf.from_mesh(solid_mesh(m3.Manifold.cylinder(4.0, 9.0, 2.0)))
+
+    def located(*_: object, **__: object) -> tuple[Transform, ...]:
+        raise AlignmentError("the job prints another part")  # as it does after four seconds
+
+    if not looked_for:
+        monkeypatch.setattr("amrepair.loop.afterwards.locate_parts", located)
     late = afterwards(plan, small.job, other, small.setup, command="gcode resume-at JOB")
     assert late.covered == ""
     assert "prints another part" in late.told[-1]

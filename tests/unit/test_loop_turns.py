@@ -200,7 +200,7 @@ def run(made: InTurn, folder: Path, scans: object, stops: tuple[Stop, ...]) -> t
 
 @pytest.mark.parametrize(
     "broken",
-    draws([None, "layer-004", "final-2", "layer-024", "layer-044"], None, "layer-004"),
+    draws([None, "layer-004", "final-2", "layer-024", "layer-044"], "layer-004"),
 )
 def test_a_void_is_filled_in_its_own_object_and_nowhere_else(
     three: InTurn, tmp_path: Path, broken: str | None

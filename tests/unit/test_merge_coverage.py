@@ -18,6 +18,7 @@ from amrepair.scans import Scan
 from amrepair.template import GridSdf, MeshSdf, load_template
 from amrepair.template.fit import fit_fast
 from amrepair.template.grid import Coverage
+from amrepair.template.options import FitOptions
 from tests.analytic import box, cylinder, difference, sample_surface, to_trimesh, union
 
 PART = difference(
@@ -126,7 +127,9 @@ def test_what_lies_behind_a_wall_that_stands_is_no_defect_of_that_wall() -> None
     The guess closes the cup higher up. The bore's true wall below that has the outer wall for its
     nearest known surface, and lies 2.4 mm behind it.
     """
-    made = fit_fast(MeshSdf.from_mesh(cup(10.0)), seed=0)
+    made = fit_fast(
+        MeshSdf.from_mesh(cup(10.0)), seed=0, options=FitOptions(cells=80, samples=60_000)
+    )
     place, normal = made.surface_points(0.4)
     in_bore = np.linalg.norm(place[:, :2], axis=1) < 11.5
     unseen = (in_bore & (place[:, 2] < 10.5)) | (place[:, 2] < 0.1)

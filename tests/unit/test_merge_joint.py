@@ -19,6 +19,7 @@ from amrepair.merge.views import Surface, View
 from amrepair.scans import Scan
 from amrepair.template.learned import Tolerance
 from tests.analytic import box, difference, sample_surface
+from tests.draws import draws
 
 SIGMA_MM = 0.03
 SPACING_MM = 0.35
@@ -82,10 +83,11 @@ def test_a_level_face_that_both_see_holds_the_height() -> None:
     assert max(slack.sigma_mm for slack in found) < SIGMA_MM
 
 
-def test_what_is_said_of_poses_is_true() -> None:
-    """Eight draws of noise, points and start: errors across the surface over what is said."""
+@pytest.mark.parametrize("seeds", draws([range(3), range(8)], range(3)), ids=len)
+def test_what_is_said_of_poses_is_true(seeds: range) -> None:
+    """Draws of noise, points and start: errors across the surface over what is said."""
     ratios = []
-    for seed in range(8):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         ways = (UP, (0.9, 0.1, 0.4), (-0.5, 0.8, 0.4))
         pieces = [look(SLOPES, 10 * seed + k, way) for k, way in enumerate(ways)]

@@ -226,7 +226,7 @@ def test_groups_that_share_too_little_stay_apart_and_both_are_told() -> None:
 def test_where_a_sensor_stood_is_among_the_guesses(
     bracket: Shape, towards: tuple[float, float, float]
 ) -> None:
-    scan, _ = view_of(bracket, towards, 3, moves=False)
+    scan, _ = view_of(bracket, towards, 3, moves=False, count=24_000)
     guess = guess_directions(scan.points_mm[:8_000])
     truth = np.array(towards) / np.linalg.norm(towards)
     # the guesses are the outermost of those that pass: the truth lies among them, not at them

@@ -49,7 +49,7 @@ CASES = [
     pytest.param("cylinder", 8.0, True, marks=pytest.mark.slow),
     pytest.param("with a hollow above", 5.0, True, marks=pytest.mark.slow),
     pytest.param("with a sheet across its hole", 8.0, True, marks=pytest.mark.slow),
-    ("block", 2.0, False),
+    pytest.param("block", 2.0, False, marks=pytest.mark.slow),
     pytest.param("cylinder", 3.0, False, marks=pytest.mark.slow),
     pytest.param("block", 5.0, True, marks=pytest.mark.slow),
     ("block", 3.0, True),

@@ -157,7 +157,7 @@ def test_scale_bow_and_pose_are_found_together() -> None:
 
 @pytest.mark.parametrize(
     "template",
-    draws([SPHERE, BOX, PLATE, BAR], BAR, SPHERE),
+    draws([SPHERE, BOX, PLATE, BAR], BAR),
     ids=["sphere", "box", "plate", "bar"],
 )
 def test_noise_alone_is_taken_for_nothing(template: analytic.AnalyticTemplate) -> None:
@@ -200,7 +200,7 @@ def test_a_worn_end_of_a_bowed_plate_is_no_bow() -> None:
 
 
 @pytest.mark.parametrize("defect", [dent, corner, worn_top, thick_top])
-@pytest.mark.parametrize("ratio", [0.0, -0.007])
+@pytest.mark.parametrize("ratio", draws([0.0, -0.007], -0.007))
 def test_defects_keep_their_depth(defect: Move, ratio: float) -> None:
     seen = Seen(BOX, scaled(ratio))
     gone_mm = defect(seen.place_mm)

@@ -170,7 +170,9 @@ def solid_of(name: str) -> tuple[trimesh.Trimesh, m3.Manifold]:
 VIEWS = ((0.4, 0.2, 0.9), (-0.7, 0.3, 0.6), (0.1, -0.8, 0.6))
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize(
+    "view", [VIEWS[0], *(pytest.param(view, marks=pytest.mark.slow) for view in VIEWS[1:])]
+)
 def test_a_bare_view_of_a_sound_part_tells_nothing_missing(
     view: tuple[float, float, float],
 ) -> None:
@@ -180,6 +182,7 @@ def test_a_bare_view_of_a_sound_part_tells_nothing_missing(
     assert deficit.missing_mm3 == 0.0
 
 
+@pytest.mark.slow
 def test_a_cut_in_a_bare_view_with_a_silhouette_is_measured() -> None:
     mesh, solid = solid_of("bracket.stl")
     corner = np.asarray(mesh.bounds)[1]

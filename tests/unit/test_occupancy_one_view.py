@@ -16,6 +16,7 @@ from amrepair.field.options import OneViewOptions
 from amrepair.frames import Transform, unit_vectors
 from amrepair.scans import Scan
 from amrepair.template import MeshSdf
+from tests.draws import draws
 from tests.unit.loop_bench import solid_mesh
 from tests.unit.test_occupancy import seen_from
 
@@ -37,7 +38,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", draws(CASES, "angle, inner edge", "channel, edge"))
 def test_what_a_wall_hides_is_not_missing(case: str) -> None:
     part, view, at_mm = CASES[case]
     tool = m3.Manifold.cube((5, 5, 4.5), True).rotate((20, 35, 50)).translate(at_mm)

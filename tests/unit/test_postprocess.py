@@ -228,6 +228,7 @@ def test_a_command_of_ones_own() -> None:
 PRUSA_SLICER = shutil.which("prusa-slicer")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PRUSA_SLICER is None, reason="PrusaSlicer is not installed here")
 def test_prusaslicer_runs_it_and_shows_its_error(tmp_path: Path) -> None:
     part, job, script = tmp_path / "part.stl", tmp_path / "job.gcode", tmp_path / "looks"

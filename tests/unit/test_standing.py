@@ -24,7 +24,7 @@ def beads(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return start, end, rng.uniform(0.0, 0.2, 6)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_bead_stands_within_half_its_width_as_high_as_its_nozzle(seed: int) -> None:
     start, end, section = beads(seed)

@@ -71,11 +71,11 @@ def test_of_two_views_it_is_the_one_that_lies_off_the_template(ball: AnalyticTem
     assert one.view == 1
 
 
-def test_views_that_agree_are_all_kept(ball: AnalyticTemplate) -> None:
-    for seed in range(3):
-        found = detect(views(ball, seed, off_mm=0.05), ball)
-        assert found.contradicting == ()
-        assert found.regions == ()
+@pytest.mark.parametrize("seed", range(3))
+def test_views_that_agree_are_all_kept(ball: AnalyticTemplate, seed: int) -> None:
+    found = detect(views(ball, seed, off_mm=0.05), ball)
+    assert found.contradicting == ()
+    assert found.regions == ()
 
 
 def test_a_dent_that_several_views_see_is_no_contradiction(ball: AnalyticTemplate) -> None:
