@@ -70,7 +70,7 @@ def undisturbed(ready: Ready, tmp_path_factory: pytest.TempPathFactory) -> list[
     return made.executed()
 
 
-STEPS = 29  # park, 26 of the repair, the way back, the modes
+STEPS = 28  # park, 26 of the repair, the way back, the modes
 
 
 def test_a_void_is_found_repaired_and_the_print_goes_on(
