@@ -39,17 +39,23 @@ def median(values, n):
 
 
 @njit(inner=True, cache=True, nogil=True)
+def put_in_order(values, along, n):
+    """Put the first n values in order, and what goes along with each: few, so by insertion."""
+    for k in range(1, n):
+        value, its, j = values[k], along[k], k
+        while j > 0 and values[j - 1] > value:
+            values[j], along[j] = values[j - 1], along[j - 1]
+            j -= 1
+        values[j], along[j] = value, its
+
+
+@njit(inner=True, cache=True, nogil=True)
 def weighted_median(values, weights, n):
     """The median of what the first n values stand for, each so many observations; put in order."""
     whole = 0.0
     for k in range(n):
         whole += weights[k]
-    for k in range(1, n):
-        value, weight, j = values[k], weights[k], k
-        while j > 0 and values[j - 1] > value:
-            values[j], weights[j] = values[j - 1], weights[j - 1]
-            j -= 1
-        values[j], weights[j] = value, weight
+    put_in_order(values, weights, n)
     below, k = weights[0], 0
     while 2.0 * below < whole and k < n - 1:
         k += 1
@@ -174,15 +180,20 @@ def window_statistics(table, count, place, value, weight, rank):
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def most_of_ranked(table, count, value, told, rank):
     """(s,) the most that is told of a window's `rank` lowest and of its `rank` highest cells."""
-    out = np.empty(table.shape[0])
-    for i in range(table.shape[0]):
-        own = table[i, : count[i]]
-        ranked = told[own[np.argsort(value[own])]]
-        at = min(rank, count[i])
-        out[i] = max(ranked[:at].max(), ranked[count[i] - at :].max())
+    n = table.shape[0]
+    out = np.empty(n)
+    for i in prange(n):
+        here, its = np.empty(MOST_NEIGHBOURS), np.empty(MOST_NEIGHBOURS)
+        size, most = np.int64(count[i]), 0.0
+        for k in range(size):
+            here[k], its[k] = value[table[i, k]], told[table[i, k]]
+        put_in_order(here, its, size)
+        for k in range(min(rank, size)):
+            most = max(most, its[k], its[size - 1 - k])
+        out[i] = most
     return out
 
 

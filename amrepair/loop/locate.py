@@ -196,7 +196,7 @@ def locate_plate(
     if _seem_several(templates):
         thing[:], count = 0, 1
     of_pick = thing[pick[ours]]
-    high_mm = 0.5 * float(np.median(beads.height_mm[pick]))
+    high_mm = _half_high_mm(beads, pick)
     insets = [_Inset(template, half_mm, high_mm) for template in templates]
     found: list[Located] = []
     for k in range(count):
@@ -467,9 +467,7 @@ def walls_moved_mm(job: Job, template: Template, placed: Transform) -> float:
     pick = (beads.layer >= 0) & of_roles(beads, OUTER_WALLS)
     if not pick.any():
         return 0.0
-    inset = _Inset(
-        template, _half_bead_mm(beads, pick), 0.5 * float(np.median(beads.height_mm[pick]))
-    )
+    inset = _Inset(template, _half_bead_mm(beads, pick), _half_high_mm(beads, pick))
     walls = _Walls(_walls(beads, np.flatnonzero(pick))).told_off(inset, placed)
     return abs(walls.outside_mm) + abs(walls.stretch) * walls.half_mm
 
@@ -483,6 +481,11 @@ def _half_bead_mm(beads: Beads, pick: Mask) -> float:
     """Half of what slicers take some beads to be wide, the median."""
     sides_mm = 0.5 * BEAD_SIDES_RATIO * beads.height_mm[pick]
     return float(np.median(half_widths_mm(beads, pick) + sides_mm))
+
+
+def _half_high_mm(beads: Beads, pick: Mask) -> float:
+    """Half of how high some beads are, the median."""
+    return 0.5 * float(np.median(beads.height_mm[pick]))
 
 
 def _nth(number: int) -> str:

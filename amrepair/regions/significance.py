@@ -265,17 +265,16 @@ def tested(
         *delta, faced = (
             scales_kernels.window_means(scale.table, scale.count, told) for told in cells[:-1]
         )
-        poses = (
-            scales_kernels.most_of_ranked(
+        ranked = pose = scales_kernels.window_medians(scale.table, scale.count, cells[-1])
+        if k == 0:  # single cells are tested at the first scale alone
+            ranked = scales_kernels.most_of_ranked(
                 scale.table, scale.count, scale.value_mm, cells[-1], RANK
-            ),
-            scales_kernels.window_medians(scale.table, scale.count, cells[-1]),
-        )
+            )
         group = seen_class(scale, faced, options.seen_step)
         most_mm = options.most_wander * point_sigma_mm(scales[0])
         views = ViewErrors.of(scale, said)
         by_cells, by_means = _errors(
-            scale, group, faced, poses, views, options, calibration, most_mm
+            scale, group, faced, (ranked, pose), views, options, calibration, most_mm
         )
         allowed_mm = np.stack(delta)
         means = np.stack([-scale.median_mm, scale.median_mm])
