@@ -25,7 +25,6 @@ from amrepair.deficit.options import DEFAULT_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import as_low_as_seen, with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
-from amrepair.field.groups import area_per_point
 from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
 from amrepair.regions import AnomalyMap, DefectType, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
@@ -352,6 +351,5 @@ def _is_skipped(box_mm: Float[np.ndarray, "2 3"], gone: PlannedBeads | None) -> 
 
 
 def _unseen_area(anomaly: AnomalyMap) -> float:
-    """The area of the unseen template points, from their mean spacing."""
-    count = int((anomaly.template_label == int(Label.UNSEEN)).sum())
-    return count * area_per_point(anomaly.template_points_mm)
+    """The area of the unseen template points, mm²."""
+    return float((anomaly.template_label == int(Label.UNSEEN)).sum()) * anomaly.each_mm2

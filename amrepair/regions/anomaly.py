@@ -111,6 +111,8 @@ class AnomalyMap:
         (n,) `Label` of each scan point; background (the bed, clutter) is OK.
     template_points_mm
         (m, 3) points spread over the template's surface.
+    each_mm2
+        The area that each of them stands for.
     template_label
         (m,) `Label` of each of them: OK (present), MISSING or UNSEEN.
     threshold_mm, threshold_source
@@ -141,6 +143,7 @@ class AnomalyMap:
     score: Values
     label: Numbers
     template_points_mm: Float[np.ndarray, "m 3"]
+    each_mm2: float
     template_label: Int[np.ndarray, " m"]
     threshold_mm: float
     threshold_source: str

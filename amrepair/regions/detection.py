@@ -101,7 +101,7 @@ def detect(
     progress("detect", 2.0, 4.0)
     evidence, surface_label = _bounded(seen, test, options)
     progress("detect", 3.0, 4.0)
-    regions = find_regions(evidence, test, seen.surface_mm, surface_label, seen.template)
+    regions = find_regions(seen, test, surface_label)
     score = np.abs(seen.f_mm)
     k = min(options.top_k, int(seen.keep.sum()))
     surfel_label = np.where(test.missing, int(Label.MISSING), test.excess * int(Label.EXCESS))
@@ -113,6 +113,7 @@ def detect(
         score=score,
         label=np.append(surfel_label, 0)[seen.surfels.of_point],
         template_points_mm=seen.surface_mm,
+        each_mm2=seen.each_mm2,
         template_label=surface_label,
         threshold_mm=test.limit_mm,
         threshold_source=_source(options, template, test.noise),

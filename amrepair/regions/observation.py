@@ -47,8 +47,8 @@ class Observed:
         each cell.
     images
         Range images of the sensors; empty where the sensors are not known.
-    surface_mm, normals
-        (m, 3) each: points spread over the template's surface, and their normals.
+    surface_mm, normals, each_mm2
+        (m, 3) points spread over the template's surface, and their normals; the area of each.
     nearest
         (m,) for each surface point the cell of the scan that lies on it; −1 where none does.
     crossed
@@ -68,6 +68,7 @@ class Observed:
     images: tuple[RangeImage, ...]
     surface_mm: Float[np.ndarray, "m 3"]
     normals: Float[np.ndarray, "m 3"]
+    each_mm2: float
     nearest: Int[np.ndarray, " m"]
     crossed: Passed
     ends: WallEnds
@@ -127,8 +128,9 @@ def observed(
             assert scan.sensor_index is not None
             sensors_mm = scan.sensors_mm[np.unique(scan.sensor_index[keep])]
             seen = tuple(i for i in seen if np.isclose(sensors_mm, i.sensor_mm).all(axis=1).any())
-    if surfels.spacing_mm > options.spacing_mm:
-        surface_mm, normals = template.surface_points(surfels.spacing_mm)
+    apart_mm = max(surfels.spacing_mm, options.spacing_mm)
+    if apart_mm > options.spacing_mm:
+        surface_mm, normals = template.surface_points(apart_mm)
     present_mm = PRESENT_CELLS * surfels.cell_mm
     nearest = nearest_within(surface_mm, surfels.place_mm, present_mm)
     outward = unit_vectors(template.distance_and_gradient(surfels.place_mm)[1])
@@ -139,8 +141,8 @@ def observed(
     ends = NO_ENDS if seen else wall_ends(scan, template, surfels, on, planes, options.wall_ends)
     shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
     return Observed(
-        scan, template, f_mm, keep, surfels, outward, seen, surface_mm, normals, nearest, crossed,
-        ends, shares,
+        scan, template, f_mm, keep, surfels, outward, seen, surface_mm, normals, apart_mm**2,
+        nearest, crossed, ends, shares,
     )  # fmt: skip
 
 

@@ -8,20 +8,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
-from amrepair.arrays import Mask, Numbers, Points, Values
-from amrepair.field.as_built import Evidence
-from amrepair.field.groups import area_per_point, group_points, touching_mm
+from amrepair.arrays import Mask, Numbers, Values
+from amrepair.field.groups import group_points, touching_mm
+from amrepair.field.near import nearest_within
 from amrepair.frames import box_of
 from amrepair.regions.anomaly import DefectType, Label, Region
 from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.noise import Noise
+from amrepair.regions.observation import Observed
 from amrepair.regions.significance import Level
 from amrepair.template.port import Template
 
 # Template points alone (seen through by rays) need this much surface to be a region.
 MIN_AREA_MM2 = 2.0
+# How dense a scan is at a place so many of the template's points around tell: 2 mm at 0.6 mm.
+AREA_POINTS = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +63,11 @@ class Tested:
     top_mm: float
 
 
-def find_regions(
-    evidence: Evidence, test: Tested, surface_mm: Points, surface_label: Numbers, template: Template
-) -> tuple[Region, ...]:
+def find_regions(seen: Observed, test: Tested, surface_label: Numbers) -> tuple[Region, ...]:
     """Group labelled cells and template points to regions, the largest first."""
-    s = evidence.surfels
+    s = seen.surfels
     labelled = surface_label == int(Label.MISSING)
-    gone, gone_p = surface_mm[labelled], test.gone_p_value[labelled]
-    area_each = area_per_point(surface_mm)
+    gone, gone_p = seen.surface_mm[labelled], test.gone_p_value[labelled]
     found: list[Region] = []
     for side, (label, cells, extra) in enumerate(
         ((Label.MISSING, test.missing, gone), (Label.EXCESS, test.excess, gone[:0]))
@@ -74,13 +75,14 @@ def find_regions(
         which = np.flatnonzero(cells)
         points = np.concatenate([s.place_mm[which], extra])
         group = group_points(points, reach_mm=touching_mm(s.cell_mm))
+        area_mm2 = _area_of(which, seen)
         for g in range(int(group.max()) + 1 if len(group) else 0):
             mine = group == g
             own = which[mine[: len(which)]]
             n_gone = int(mine[len(which) :].sum())
-            if len(own) == 0 and n_gone * area_each < MIN_AREA_MM2:
+            if len(own) == 0 and n_gone * seen.each_mm2 < MIN_AREA_MM2:
                 continue
-            region = _region(label, s.deviation_mm[own], points[mine], s.cell_mm, template)
+            region = _region(label, seen, own, area_mm2[mine[: len(which)]], points[mine])
             sure = np.append(
                 np.exp(test.log_p[side, own]), gone_p[: len(extra)][mine[len(which) :]]
             )
@@ -90,17 +92,35 @@ def find_regions(
 
 def _region(
     label: Label,
-    deviation_mm: Values,
+    seen: Observed,
+    own: Numbers,
+    area_mm2: Values,
     points_mm: Float[np.ndarray, "p 3"],
-    cell_mm: float,
-    template: Template,
 ) -> Region:
-    """Measure one group, and classify it."""
+    """Measure one group, of the cells `own` that stand for so much area each, and classify it."""
     box = box_of(points_mm)
-    depth = float(np.abs(deviation_mm).max()) if len(deviation_mm) else float(np.ptp(box, 0).min())
-    area = max(len(deviation_mm), 1) * cell_mm**2
-    volume = float(np.abs(deviation_mm).sum()) * cell_mm**2
-    return Region(label, classify(label, depth, area, box, template), volume, area, depth, box)
+    off_mm = np.abs(seen.surfels.deviation_mm[own])
+    depth = float(off_mm.max()) if len(own) else float(np.ptp(box, 0).min())
+    area = float(area_mm2.sum())
+    kind = classify(label, depth, area, box, seen.template)
+    return Region(label, kind, float((area_mm2 * off_mm).sum()), area, depth, box)
+
+
+def _area_of(which: Int[np.ndarray, " c"], seen: Observed) -> Float[np.ndarray, " c"]:
+    """(c,) the area of the template, mm², that the points of some cells stand for.
+
+    That is their share of all points over the template around: noise spreads one place over several
+    cells, one above the other, so that cells themselves are more than the surface holds.
+    """
+    s = seen.surfels
+    feet_mm = s.place_mm - s.deviation_mm[:, None] * seen.outward
+    over = nearest_within(feet_mm, seen.surface_mm, touching_mm(s.cell_mm))
+    points = np.bincount(over[over >= 0], s.count[over >= 0], len(seen.surface_mm))
+    shown = (points > 0) | (seen.nearest >= 0)
+    every = min(AREA_POINTS, len(shown))
+    around = cKDTree(seen.surface_mm).query(feet_mm[which], every)[1].reshape(-1, every)
+    each = points[around].sum(axis=1) / np.maximum(shown[around].sum(axis=1), 1)
+    return s.count[which] * seen.each_mm2 / np.maximum(each, 1.0)
 
 
 def classify(

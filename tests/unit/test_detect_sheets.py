@@ -7,13 +7,14 @@ import pytest
 
 from amrepair.regions import Label, detect
 from amrepair.scans import Scan
-from tests.analytic import box, sample_surface
+from amrepair.template import MeshSdf
+from tests.analytic import box, sample_surface, to_trimesh
 
 SIGMA_MM = 0.05
 PLATE = box((0, 0, 0), (24, 20, 4))
 
 
-def merged(pitches_mm: list[float], low_mm: list[float]) -> Scan:
+def merged(pitches_mm: list[float], low_mm: list[float], sigma_mm: float = SIGMA_MM) -> Scan:
     """The plate from above, a raster of each pitch; so low each has a disc 6 mm wide."""
     rng = np.random.default_rng(5)
     views = []
@@ -27,7 +28,7 @@ def merged(pitches_mm: list[float], low_mm: list[float]) -> Scan:
     sides = sample_surface(PLATE.body, 0.12, seed=1)[0]
     views.append(sides[sides[:, 2] < 4 - 1e-6])
     points = np.concatenate(views)
-    return Scan(points + rng.normal(0, SIGMA_MM, points.shape), SIGMA_MM, "template")
+    return Scan(points + rng.normal(0, sigma_mm, points.shape), sigma_mm, "template")
 
 
 @pytest.mark.parametrize("low_mm", [0.6, -0.6])
@@ -49,3 +50,13 @@ def test_what_all_views_see_off_is_off(low_mm: float) -> None:
     (found,) = detect(merged([0.2, 0.2, 0.3], [low_mm] * 3), PLATE).regions
     assert found.label == (Label.MISSING if low_mm > 0 else Label.EXCESS)
     assert (np.abs(found.box_mm[:, :2] - [(10, 6), (16, 12)]) < 0.3).all()
+
+
+@pytest.mark.parametrize("sigma_mm", [0.02, 0.12])
+def test_a_region_is_as_large_as_the_surface_that_it_lies_over(sigma_mm: float) -> None:
+    # regression: area and volume counted cells, of which noise fills two, one above the other
+    scan = merged([0.2, 0.2, 0.3], [0.6] * 3, sigma_mm)
+    (found,) = detect(scan, MeshSdf.from_mesh(to_trimesh(PLATE.body))).regions
+    disc_mm2 = np.pi * 3.0**2
+    assert found.area_mm2 == pytest.approx(disc_mm2, rel=0.04)
+    assert found.volume_mm3 == pytest.approx(0.6 * disc_mm2, rel=0.04)
