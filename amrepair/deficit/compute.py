@@ -25,6 +25,7 @@ from amrepair.deficit.options import DEFAULT_DEFICIT, DeficitOptions
 from amrepair.deficit.solids import pieces_of
 from amrepair.deficit.walls import as_low_as_seen, with_rims, with_sharp_walls
 from amrepair.field.as_built import Evidence, with_stubs
+from amrepair.field.groups import touching_mm
 from amrepair.frames import Transform, box_of, boxes_meet, in_box, nearest_box
 from amrepair.regions import AnomalyMap, DefectType, Label, Region, detect
 from amrepair.regions.options import SkippedOptions
@@ -274,11 +275,14 @@ def measured_regions(anomaly: AnomalyMap, deficit: Deficit) -> tuple[Region, ...
         Of the same anomaly, computed with the template's frame as build frame.
     """
     pieces: dict[int, list[Region]] = {k: [] for k in range(-1, len(anomaly.regions))}
+    assert anomaly.evidence is not None
+    # pieces so near to each other are one defect
+    beside_mm = np.outer((-1.0, 1.0), np.full(3, touching_mm(anomaly.evidence.surfels.cell_mm)))
     for piece in deficit.regions:
         near = [
             k
             for k, region in enumerate(anomaly.regions)
-            if region.label is piece.label and boxes_meet(region.box_mm, piece.box_mm)
+            if region.label is piece.label and boxes_meet(region.box_mm + beside_mm, piece.box_mm)
         ]
         known = [anomaly.regions[k].box_mm for k in near]
         pieces[near[nearest_box(known, piece.box_mm)] if near else -1].append(piece)

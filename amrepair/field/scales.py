@@ -21,8 +21,6 @@ from amrepair.frames import cells_of, unit_vectors
 WINDOW_FACING = 0.5
 # The third lowest and third highest cell of a window count: three cells are a surface, two chance.
 RANK = 3
-# The weight of a cell of stray points: it keeps its place, but hardly counts in windows around it.
-NOTHING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +99,7 @@ def scales_of(
 ) -> tuple[Scale, ...]:
     """Make the scales, from cells of `cell_mm` up to windows of `widest_mm`.
 
-    Cells that hold no surface at the first scale are given no direction and hardly any weight at
-    the wider ones.
+    What is no surface at one scale may be one at a wider: a place that was seen sparsely.
 
     Parameters
     ----------
@@ -126,11 +123,6 @@ def scales_of(
             return tuple(found)
         of_base = scale.of_base
         inner = (scale.place_mm, scale.normal, scale.value_mm, scale.weight, scale.apart)
-        if len(found) == 1:
-            stray = ~scale.is_surface
-            normal = np.where(stray[:, None], 0.0, scale.normal)
-            weight = np.where(stray, NOTHING, scale.weight)
-            inner = (scale.place_mm, normal, scale.value_mm, weight, scale.apart)
         size_mm *= 2.0
 
 

@@ -39,7 +39,8 @@ class Noise:
     source
         Where the noise is from: this scan, or a profile where it has too few points.
     judged_share
-        Of the points: of the others too few lie together for anything to be told of them.
+        Of the points: of the others too few lie together, in windows of any width, for anything to
+        be told of them.
     """
 
     sigma_mm: float
@@ -57,7 +58,7 @@ class Noise:
 
     def told_sparse(self) -> str:
         """What a scan with too few points cannot tell, in a sentence."""
-        cell_mm = float(np.sqrt(self.smallest_mm[0][0] / CELLS_OF_WINDOW))
+        cell_mm = float(np.sqrt(self.smallest_mm[-1][0] / CELLS_OF_WINDOW))
         return (
             f"Only {100 * self.judged_share:.0f} % of the points could be judged: elsewhere fewer "
             f"than two lie in a cell of {cell_mm:.1f} mm, and a defect there would not be seen; "
@@ -98,7 +99,6 @@ def noise_of(
     first = levels[0].scale
     told = len(first) >= options.least_cells
     sigma_mm = point_sigma_mm(first) if told else profile_mm
-    judged = first.is_surface
     off = np.abs(first.value_mm - first.median_mm) > OUTLIER_SIGMAS * np.maximum(
         first.noise_mm, 1e-9
     )
@@ -111,8 +111,19 @@ def noise_of(
             (CELLS_OF_WINDOW * level.scale.cell_mm**2, level.smallest_mm) for level in levels[1:]
         ),
         source="this scan" if told else f"the profile's, {len(first)} cells are too few to tell",
-        judged_share=float(first.weight[judged].sum() / first.weight.sum()),
+        judged_share=_judged_share(levels),
     )
+
+
+def _judged_share(levels: tuple[Level, ...]) -> float:
+    """Of the points, how many lie where a window of some width is surface."""
+    first = levels[0].scale
+    judged = np.zeros(len(first.of_base), bool)
+    for level in levels[1:]:
+        judged |= level.scale.is_surface[level.scale.of_base]
+    points = first.weight / np.bincount(first.of_base, minlength=len(first))
+    each = points[first.of_base]
+    return float(each[judged].sum() / each.sum())
 
 
 def _correlation_mm(scales: list[Scale]) -> float:

@@ -60,3 +60,12 @@ def test_a_region_is_as_large_as_the_surface_that_it_lies_over(sigma_mm: float) 
     disc_mm2 = np.pi * 3.0**2
     assert found.area_mm2 == pytest.approx(disc_mm2, rel=0.04)
     assert found.volume_mm3 == pytest.approx(0.6 * disc_mm2, rel=0.04)
+
+
+@pytest.mark.parametrize("low_mm", [0.6, -0.6])
+def test_what_was_seen_sparsely_is_judged_over_wider_windows(low_mm: float) -> None:
+    # regression: of a top with a tenth of the sides' points nothing was found, nor said
+    scan = merged([0.4], [low_mm])
+    (found,) = detect(scan, PLATE).regions
+    assert found.label == (Label.MISSING if low_mm > 0 else Label.EXCESS)
+    assert (np.abs(found.box_mm[:, :2] - [(10, 6), (16, 12)]) < 0.5).all()
