@@ -21,6 +21,8 @@ from amrepair.frames import cells_of, unit_vectors
 WINDOW_FACING = 0.5
 # The third lowest and third highest cell of a window count: three cells are a surface, two chance.
 RANK = 3
+# The weight of a point of what is no surface, beside points of what is: next to none.
+NOTHING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,8 @@ def scales_of(
 ) -> tuple[Scale, ...]:
     """Make the scales, from cells of `cell_mm` up to windows of `widest_mm`.
 
-    What is no surface at one scale may be one at a wider: a place that was seen sparsely.
+    What is no surface at one scale may be one at a wider: a place that was seen sparsely. It counts
+    in the wider cells that hold nothing else; beside surface it is strays.
 
     Parameters
     ----------
@@ -122,7 +125,8 @@ def scales_of(
         if 2.0 * 3.0 * size_mm > widest_mm or len(scale) <= kernels.MOST_NEIGHBOURS:
             return tuple(found)
         of_base = scale.of_base
-        inner = (scale.place_mm, scale.normal, scale.value_mm, scale.weight, scale.apart)
+        weight = np.where(scale.is_surface, scale.weight, NOTHING * scale.weight)
+        inner = (scale.place_mm, scale.normal, scale.value_mm, weight, scale.apart)
         size_mm *= 2.0
 
 
@@ -150,6 +154,7 @@ def _scale(
         if medians
         else np.add.reduceat((value_mm * weight)[order], first) / total
     )
+    total = np.where(total < 0.5, total / NOTHING, total)  # a point that counts weighs 1
     table, count = kernels.neighbours(keys, *strides, facing, value, WINDOW_FACING, 0.5 * cell_mm)
     median, low, high, noise, around = kernels.window_statistics(
         table, count, place, value, total, RANK

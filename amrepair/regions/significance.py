@@ -37,6 +37,8 @@ from amrepair.regions.options import RegionOptions
 
 # A quarter of the differences of two standard normal values are smaller: √2 Φ⁻¹(5/8).
 PAIR_QUARTILE = float(np.sqrt(2.0) * ndtri(0.625))
+# Of the 3 × 3 cells of a plane's window, those that one at its rim has.
+FULL_WINDOW = 2 * RANK
 # Standard error of a median, of that of a mean, for normal noise: √(π/2).
 MEDIAN_LOSS = float(np.sqrt(np.pi / 2))
 # Of fewer peaks the lower half is too few to tell a tail from.
@@ -271,6 +273,7 @@ def tested(
                 scale.table, scale.count, scale.value_mm, cells[-1], RANK
             )
         group = seen_class(scale, faced, options.seen_step)
+        judged = scale.is_surface & ~_scattered(scale, scales[0], group, options)
         most_mm = options.most_wander * point_sigma_mm(scales[0])
         views = ViewErrors.of(scale, said)
         by_cells, by_means = _errors(
@@ -281,9 +284,27 @@ def tested(
         thirds = np.stack([-scale.low_mm, scale.high_mm])
         for statistic, sides, errors in ((0, thirds, by_cells), (1, means, by_means))[k > 0 :]:
             levels.append(
-                _level(scale, sides, allowed_mm, errors, share, options, calibration, statistic)
+                _level(
+                    scale, judged, sides, allowed_mm, errors, share, options, calibration, statistic
+                )
             )
     return tuple(levels)
+
+
+def _scattered(scale: Scale, first: Scale, group: Numbers, options: RegionOptions) -> Mask:
+    """(s,) windows of sparse points that tell nothing: strays, or seen as no others were.
+
+    A surface fills its windows, those at its rim by two thirds, however sparsely it was seen; and
+    what errors it has there only enough windows tell that were seen as badly, or worse.
+    """
+    sparse = ~first.is_surface[first.of_base]
+    size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
+    share = np.bincount(scale.of_base, sparse, len(scale)) / size
+    mostly = scales_kernels.window_means(scale.table, scale.count, share) > 0.5
+    filled = scale.is_surface & (scale.count >= FULL_WINDOW)
+    alike = np.bincount(group[mostly & filled], minlength=int(group.max()) + 1)
+    as_badly = np.cumsum(alike[::-1])[::-1]
+    return np.asarray(mostly & ~(filled & (as_badly[group] >= options.least_cells)))
 
 
 def point_sigma_mm(first: Scale) -> float:
@@ -415,6 +436,7 @@ def _freedom(
 
 def _level(
     scale: Scale,
+    judged: Mask,
     sides: Float[np.ndarray, "2 s"],
     tolerance_mm: Float[np.ndarray, "2 s"],
     errors: Errors,
@@ -425,8 +447,9 @@ def _level(
 ) -> Level:
     """Standardise one statistic, and find from which value on it is significant.
 
-    `statistic` is 0 for the third lowest and highest cells, 1 for medians; `share` is the number of
-    false regions that this level may cause on one side.
+    `judged` windows are tested, the others are not; `statistic` is 0 for the third lowest and
+    highest cells, 1 for medians; `share` is the number of false regions that this level may cause
+    on one side.
     """
     own_mm, together = (
         (errors.cell_mm, errors.independent) if statistic == 0 else (errors.window_mm, 1.0)
@@ -435,9 +458,8 @@ def _level(
     freedom = errors.freedom_of(error_mm)
     beyond_mm = sides - tolerance_mm
     z = as_normal(beyond_mm / error_mm, freedom)
-    alone = ~scale.is_surface
-    z[:, alone] = -np.inf
-    n = max(int((~alone).sum()), 1)
+    z[:, ~judged] = -np.inf
+    n = max(int(judged.sum()), 1)
     # the chance that r = `together` of the k cells of a window are all so far out: C(k, r) · Q^r
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
