@@ -20,10 +20,15 @@ import pytest
 from tests.emulators import Forked
 from tests.workers import pytest_runtestloop  # noqa: F401 - a hook
 
-# Workers share the cores: threads of one that spin for their turn take the other's time.
-if any(word.startswith("--workers") for word in sys.argv):
+# Workers share the cores: threads of one that spin for their turn take the other's time. With one
+# thread each, loops of kernels are compiled as loops, in a third of the time that it takes to make
+# them ready for threads, and are kept apart. Without workers kernels are as users have them.
+BY_WORKERS = any(word.startswith("--workers") for word in sys.argv)
+if BY_WORKERS:
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
+    _kept = os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / ".pytest_cache"
+    os.environ["NUMBA_CACHE_DIR"] = str(Path(_kept, "kernels-without-threads"))
 
 # Of so many tests some compile a kernel.
 MANY_TESTS = 500
@@ -32,6 +37,10 @@ MANY_TESTS = 500
 signal.signal(signal.SIGINT, signal.default_int_handler)
 importlib.import_module("gcode.process").prepare()  # as the commands do, before numpy is loaded
 importlib.import_module("tests.shapes").install(["amrepair", "gcode"])
+if BY_WORKERS:
+    _compiled = importlib.import_module("gcode.compiled")
+    _njit = _compiled.njit
+    _compiled.njit = lambda **options: _njit(**{**options, "parallel": False})
 
 hypothesis.settings.register_profile(
     "suite",
