@@ -37,7 +37,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 suite: $(EXTRAS)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope
+	$(BIN)/python -m pytest --workers $(WORKERS)
 
 slow: $(EXTRAS) ## the tests that are too dear for every run, and further draws of those that draw
 	$(BIN)/python -m pytest -m slow

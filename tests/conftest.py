@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import importlib
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,17 +18,29 @@ import hypothesis
 import pytest
 
 from tests.emulators import Forked
+from tests.workers import pytest_runtestloop  # noqa: F401 - a hook
 
-# Workers share the cores: threads of one that spin for their turn take the other's time.
-if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
-    _share = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+# Workers share the cores: threads of one that spin for their turn take the other's time. With one
+# thread each, loops of kernels are compiled as loops, in a third of the time that it takes to make
+# them ready for threads, and are kept apart. Without workers kernels are as users have them.
+BY_WORKERS = any(word.startswith("--workers") for word in sys.argv)
+if BY_WORKERS:
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(_name, str(_share))
+        os.environ.setdefault(_name, "1")
+    _kept = os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / ".pytest_cache"
+    os.environ["NUMBA_CACHE_DIR"] = str(Path(_kept, "kernels-without-threads"))
+
+# Of so many tests some compile a kernel.
+MANY_TESTS = 500
 
 # a shell that starts the tests in the background has them ignore what some of them send
 signal.signal(signal.SIGINT, signal.default_int_handler)
 importlib.import_module("gcode.process").prepare()  # as the commands do, before numpy is loaded
 importlib.import_module("tests.shapes").install(["amrepair", "gcode"])
+if BY_WORKERS:
+    _compiled = importlib.import_module("gcode.compiled")
+    _njit = _compiled.njit
+    _compiled.njit = lambda **options: _njit(**{**options, "parallel": False})
 
 hypothesis.settings.register_profile(
     "suite",
@@ -41,22 +53,7 @@ hypothesis.settings.load_profile("suite")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--regenerate-golden", action="store_true", help="write golden files anew")
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection(session: pytest.Session) -> None:
-    """Load a share of the tests before all are collected.
-
-    pytest rewrites the asserts of a module where no worker has done so and kept it. Workers that
-    collect in one order rewrite the same module at the same time, each for itself.
-    """
-    worker = os.environ.get("PYTEST_XDIST_WORKER")
-    if worker is None or session.config.args != session.config.getini("testpaths"):
-        return
-    here, count = Path(__file__).parent, int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
-    for path in sorted(here.rglob("test_*.py"))[int(worker.removeprefix("gw")) :: count]:
-        with contextlib.suppress(Exception, pytest.skip.Exception):  # told when collected
-            importlib.import_module(".".join(path.relative_to(here.parent).with_suffix("").parts))
+    parser.addoption("--workers", type=int, default=1, help="forked processes that run the tests")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -68,8 +65,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
 
 
-def pytest_collection_finish() -> None:
-    """What is loaded by now stays: to look through it time and again took a twentieth of a run."""
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """What is loaded by now stays: to look through it time and again took a twentieth of a run.
+
+    What numba loads and sets up with its first kernel, no forked worker need do again.
+    """
+    if session.config.getoption("--workers") > 1 and len(session.items) > MANY_TESTS:
+        import numba
+        import numpy as np
+
+        numba.njit(lambda values: np.sort(values * 2).sum())(np.ones(3))
     gc.collect()
     gc.freeze()
 

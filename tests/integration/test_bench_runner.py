@@ -45,6 +45,7 @@ def without_times(row: object) -> object:
     return replace(row, seconds_per_sample=0.0, fit_seconds=0.0)  # type: ignore[type-var]
 
 
+@pytest.mark.slow
 def test_figures_are_those_of_a_straight_computation(dataset: Path, tmp_path: Path) -> None:
     report = run_bench(dataset, format=LAYOUT, methods=["btf-raw"], out=tmp_path, seeds=[4])
     (block, _) = open_dataset(dataset, LAYOUT).classes

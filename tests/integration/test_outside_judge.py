@@ -208,6 +208,7 @@ def test_contact_of_the_cone_is_told_however_walls_lie_to_columns(aside_mm: floa
     assert told == pytest.approx(0.083, abs=0.011)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cell_mm", [0.13, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_what_stands_of_a_large_part_is_known_in_wider_cells_and_cleared(cell_mm: float) -> None:
     # regression: a cone reads deeper in wider cells, and the checker refused such repairs, as of a

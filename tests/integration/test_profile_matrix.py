@@ -11,11 +11,17 @@ from gcode.check import find_refusals
 from gcode.profiles import list_profiles, load_setup
 from gcode.slicing.job import slice_part
 from gcode.writer import write
+from tests.draws import draws
 
+# One of each maker and kind of firmware; the others are of a kind with one of these.
+EACH_RUN = (
+    "generic_marlin", "generic_klipper", "generic_reprap", "anycubic_kobra", "creality_k1",
+    "ender_3", "ender_3_v3_ke", "prusa_mini", "prusa_mk3s", "prusa_xl_2t", "voron_2_4",
+)  # fmt: skip
 SIDE_MM, HIGH_MM = 8.0, 0.8  # infill and two layers after the first
 
 
-@pytest.mark.parametrize("printer", list_profiles("printers"))
+@pytest.mark.parametrize("printer", draws(list_profiles("printers"), *EACH_RUN))
 def test_every_material_and_process_slices_and_passes(printer: str) -> None:
     """regression: 125 of 300 were refused for their own prime line, and ASA on a Mini."""
     box = m3.Manifold.cube((SIDE_MM, SIDE_MM, HIGH_MM)).translate((90.0, 90.0, 0.0))

@@ -125,7 +125,7 @@ def judge(made: Resumption, job: Program, setup: PrintSetup) -> Ran:
         pytest.param("prusaslicer-cube", "generic_reprap", 60, marks=pytest.mark.slow),
         pytest.param("screw", "generic_marlin", 110, marks=pytest.mark.slow),
         ("vase", "ender_3", 300),
-        ("cura_slicer", "voron_2_4", 12),
+        pytest.param("cura_slicer", "voron_2_4", 12, marks=pytest.mark.slow),
         pytest.param("orca_slicer", "voron_2_4", 170, marks=pytest.mark.slow),
     ],
 )

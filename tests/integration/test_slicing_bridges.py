@@ -154,6 +154,7 @@ def test_the_next_pass_fills_what_strands_sag_by() -> None:
     assert sections[0.001] - sections[0.0] == pytest.approx(more_mm3, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_span_too_long_is_told_with_its_length_and_volume() -> None:
     part = OnLegs(34.0)
     plan, _, _ = part.planned()
@@ -304,6 +305,7 @@ def test_the_checker_knows_a_bridge_by_itself() -> None:
     }
 
 
+@pytest.mark.slow
 def test_along_a_jobs_lines_a_slot_is_begun_where_the_head_first_gets_in() -> None:
     # regression: where that is one of the job's own heights no line found a hold there, nor any
     # above it: declared 0.03 of a slot of which the head reaches 0.22

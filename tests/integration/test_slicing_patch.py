@@ -294,6 +294,7 @@ def test_a_flat_top_is_one_however_its_height_was_rounded() -> None:
     assert plan.beads_mm3 == pytest.approx(missing.volume(), rel=0.03)
 
 
+@pytest.mark.slow
 def test_overhangs_grow_as_far_along_a_diagonal_as_along_the_grid() -> None:
     """By one and the same distance a layer: a diamond of cells held diagonals back."""
     shares = []
@@ -426,6 +427,7 @@ def test_whatever_the_order_nothing_is_hit_and_nothing_is_left_out(seed: int) ->
     assert plan.beads_mm3 == pytest.approx(plan.reachable_mm3, rel=0.08)
 
 
+@pytest.mark.slow
 def test_a_steep_slope_is_filled_from_its_deep_end() -> None:
     """The head keeps the tip off a slope: no first bead was thin enough, so little was laid."""
     block = m3.Manifold.cube((30.0, 30.0, 10.0)).translate((60.0, 60.0, 0.0))
@@ -523,6 +525,7 @@ def test_beads_grow_a_line_s_width_a_layer_out_over_what_is_out_of_reach() -> No
     assert (np.diff(wide) < 2 * 0.7 + ASIDE_MM).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("higher_mm", draws([0.05, 0.1, 0.15], 0.1))
 def test_where_the_layers_lie_hardly_decides_how_much_of_a_pit_is_filled(higher_mm: float) -> None:
     """Beads over a hollow began at the layer after the one at which the head got in."""

@@ -108,7 +108,7 @@ def test_the_nozzle_is_primed_and_wiped_beside_the_part_before_it_touches_it() -
         ("ender_3", 60.0, 40.0, True),
         ("ender_3", 150.0, 12.0, False),  # the duct has no room beside it
         pytest.param("ender_3", 150.0, 40.0, False, marks=pytest.mark.slow),
-        ("prusa_mk3s", 180.0, 40.0, False),
+        pytest.param("prusa_mk3s", 180.0, 40.0, False, marks=pytest.mark.slow),
         ("prusa_mk3s", 180.0, 10.0, True),  # not at the profile's own place
     ],
 )

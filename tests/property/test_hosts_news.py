@@ -53,7 +53,7 @@ MOONRAKER = JSON | shaped(
 )
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(st.lists(OCTOPRINT, max_size=6), CURRENT | JSON)
 def test_octoprints_news(messages: list[Any], report: Any) -> None:
     state = ServerState()
@@ -67,7 +67,7 @@ def test_octoprints_news(messages: list[Any], report: Any) -> None:
         assert isinstance(state.look(report, {}), bool)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(st.lists(MOONRAKER, max_size=6))
 def test_moonrakers_news(messages: list[Any]) -> None:
     state = KlippyState()

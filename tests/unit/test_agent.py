@@ -415,6 +415,7 @@ gcode:
 """
 
 
+@pytest.mark.slow
 def test_what_the_user_s_pause_pulls_back_is_not_lacking_in_the_repair(bench: Bench) -> None:
     """Mainsail's and Fluidd's macros pull 1 mm: a patch lacked 2.4 mm³, and a blob was left."""
     klipper = bench.klipper

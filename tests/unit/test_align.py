@@ -143,6 +143,7 @@ def narrow_walls(height_mm: float, *, narrower_mm: float, from_mm: float) -> tri
     return trimesh.boolean.union(solids, engine="manifold")
 
 
+@pytest.mark.slow
 def test_walls_that_were_laid_narrower_leave_a_pose() -> None:
     # regression: both sides of each wall lie inside, so that the pose slides slowly along a shallow
     # valley; after 60 steps a look "did not converge", and two of them ended the run

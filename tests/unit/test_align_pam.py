@@ -57,6 +57,7 @@ def run(template: MeshSdf, points: np.ndarray, options: PamOptions) -> Registrat
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [STRICT, pytest.param(replace(RELEASED_PAM, target_points=15_000), marks=pytest.mark.slow)],

@@ -123,6 +123,7 @@ def test_the_sensor_tells_on_which_side_of_a_plate_a_view_lies(side: float) -> N
     assert np.abs(found.template_from_scan.apply(moved) - points).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_turn_that_nothing_hinders_is_reported() -> None:
     rod = cylinder((0, 0, 0), 8.0, 30.0)
     found, _ = aligned(rod, sample_surface(rod.body, 1.0, seed=2)[0])
@@ -181,6 +182,7 @@ def test_clutter_does_not_mislead() -> None:
     assert found.inlier_ratio + found.clutter_ratio > 0.9
 
 
+@pytest.mark.slow
 def test_a_refusal_names_sizes_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("amrepair.align.anywhere.by_features", lambda *_: iter(()))
     template = notched()
@@ -351,6 +353,7 @@ def test_a_small_mark_on_the_other_side_of_a_disc_is_found(
     assert np.abs(found.template_from_scan.apply(points) - points).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_view_of_a_bent_thin_plate_lies_on_its_larger_piece(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

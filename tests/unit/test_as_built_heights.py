@@ -116,6 +116,7 @@ def test_where_the_view_ended_what_is_told_missing_still_stands_for_the_head() -
     assert heights(field, (22.0, 29.0), (11.0, 19.0)).min() > 11.9
 
 
+@pytest.mark.slow
 def test_a_thin_roof_that_is_left_is_a_floor() -> None:
     """Less than two layers over a hollow was taken for the rounding of a rim."""
     part = box(0, 0, 0, 30, 20, 6) - box(8, -1, 1, 22, 21, 3.7)
@@ -125,6 +126,7 @@ def test_a_thin_roof_that_is_left_is_a_floor() -> None:
     assert inside.max() == pytest.approx(4.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_the_lip_of_a_cut_stands_as_high_as_it_was_seen() -> None:
     """The solids round it off, and the head's body grazed a wall that was said to be lower."""
     part = box(0, 0, 0, 22, 16, 10)
@@ -144,6 +146,7 @@ def test_a_stray_point_is_no_pole_and_a_pole_is_one() -> None:
     assert heights(field, (9.9, 10.5), (4.9, 5.5)).max() > 4.5
 
 
+@pytest.mark.slow
 def test_what_is_thinner_than_the_scan_is_fine_stands_as_high_as_it_was_seen() -> None:
     """Cells took the mean of a crest and what lies beside it: the tip went 0.21 mm into one."""
     part = box(0, 0, 0, 40, 30, 4)
@@ -182,6 +185,7 @@ def test_what_hangs_on_over_a_floor_that_was_seen_has_points_on_it_or_is_gone() 
     assert heights(stands, (8.1, 11.9), (9.85, 10.05)).min() > 7.4
 
 
+@pytest.mark.slow
 def test_the_roof_of_a_hollow_goes_with_what_held_it() -> None:
     """Too thin for the erosion, it hung on in the air, and the nozzle had to stay above it."""
     hollows = [
@@ -195,6 +199,7 @@ def test_the_roof_of_a_hollow_goes_with_what_held_it() -> None:
     assert heights(field, (16.0, 29.0), (1.0, 17.0)).max() < 0.1
 
 
+@pytest.mark.slow
 def test_no_cell_of_few_points_holds_the_head_up() -> None:
     """One in some thousand cells lies 0.1 mm off by noise; lips took the noise of theirs."""
     part = box(0, 0, 0, 40, 30, 6)
@@ -237,6 +242,7 @@ def test_the_corner_of_a_pit_is_as_low_as_its_floor() -> None:
     assert (told.z_mm[~pit] == 4.0).all()
 
 
+@pytest.mark.slow
 def test_the_foot_of_a_slope_is_as_low_as_it_was_seen() -> None:
     """A worn edge ended a quarter of a millimetre over the bed, and nothing was laid beside it."""
     side = ((10.0, 0.0), (10.0, 7.0), (15.4, 3.6), (15.4, 7.0))

@@ -97,6 +97,7 @@ def test_rows_say_what_is_there(serial: Path) -> None:
     assert ".hidden.ply" not in rows
 
 
+@pytest.mark.slow
 def test_spawned_workers_and_a_killed_one_come_to_the_same(
     ready: Path, serial: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -362,6 +363,7 @@ def test_mixed_parts_are_told_apart_and_what_fits_none_is_a_row(
     assert report.refused == 1
 
 
+@pytest.mark.slow
 def test_a_template_that_fits_none_is_told_and_is_no_success(ready: Path, tmp_path: Path) -> None:
     from amrepair.cli.app import app
 

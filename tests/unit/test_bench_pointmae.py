@@ -21,6 +21,7 @@ def published() -> ModuleType:
     return importlib.import_module("pointmae_reference")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", draws(["pointmae", "pointbert"], "pointmae"))
 def test_forward_pass_is_the_published_architecture(
     published: ModuleType, tmp_path: Path, kind: str

@@ -148,6 +148,7 @@ def test_what_was_refused_meets_no_goal(bench: ModuleType) -> None:
     assert goals.count("| NO |") == 6
 
 
+@pytest.mark.slow
 def test_memory_is_the_childs_own(bench: ModuleType) -> None:
     ballast = np.ones(60_000_000)  # 0.48 GB, the parent's
     found = bench.run(["--version"], 60.0)
@@ -156,6 +157,7 @@ def test_memory_is_the_childs_own(bench: ModuleType) -> None:
     assert ballast.sum() > 0
 
 
+@pytest.mark.slow
 def test_baseline_finds_a_dent_and_nothing_else(bench: ModuleType, scans: ModuleType) -> None:
     small = 15.0 / RADIUS_MM
     surface = scans.Surface(trimesh.creation.icosphere(4, 15.0))

@@ -70,6 +70,7 @@ def test_a_dent_is_surer_than_any_sound_scan(
     assert sound.judge(dented(scanned(50), radius_mm, depth_mm)).log_expected < least - 2.0
 
 
+@pytest.mark.slow
 def test_a_bias_that_all_sound_parts_have_is_normal(template: GridSdf) -> None:
     """Nothing of a foot of 0.3 mm counts, and a dent beside it does."""
 
@@ -87,6 +88,7 @@ def test_a_bias_that_all_sound_parts_have_is_normal(template: GridSdf) -> None:
     assert learned.judge(dented(printed(9), 2.0, 0.5)).log_expected < np.log(1e-3)
 
 
+@pytest.mark.slow
 def test_what_no_scan_saw_speaks_against_none(template: GridSdf, sound: SoundTest) -> None:
     """Not where the sound scans have a hole; nor where a single one's template is a guess."""
     dent = dented(scanned(50), 2.0, 0.6)
@@ -119,6 +121,7 @@ def test_a_defect_beside_what_no_scan_saw_is_found(template: GridSdf) -> None:
     assert SoundTest.of(template, holed).judge(dented(scanned(50), 2.0, 0.6)).log_expected < -10.0
 
 
+@pytest.mark.slow
 def test_a_hollow_deeper_than_the_template_guesses_is_unknown() -> None:
     """The sound scans saw the pocket's rim alone, and the template closes it at half its depth."""
     import trimesh
@@ -154,6 +157,7 @@ def test_a_single_point_is_no_defect(sound: SoundTest) -> None:
     assert sound.judge(points).log_expected < -10.0
 
 
+@pytest.mark.slow
 def test_what_few_sound_points_err_by_is_common_to_many_of_a_scan(template: GridSdf) -> None:
     """A near view of a side that sound scans saw aslant is as likely as they are.
 

@@ -187,6 +187,7 @@ def test_sizes_are_drawn_between_the_smallest_and_the_usual() -> None:
     assert SynthOptions().size(rng) == Size()
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(box_file: Path, tmp_path: Path) -> None:
     def digest(folder: Path) -> dict[str, str]:
         return {

@@ -20,7 +20,6 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.errors import TypingError
 from numba.extending import overload
 
-from amrepair.template import signs_kernels
 from gcode import compiled
 from gcode.slicing import infill_kernels
 
@@ -230,12 +229,18 @@ def test_what_is_read_alone_is_of_one_type_whoever_may_write_to_it() -> None:
 
 def test_threads_are_those_that_sleep_while_they_wait() -> None:
     """TBB's spin, beside other processes, and kept one that was done from ending."""
-    size = np.ones((1, 2, 2, 2), dtype=np.float32)
-    signs_kernels.spread(size, np.ones(size.shape, dtype=np.int8), np.float32(0.5))
+
+    @numba.njit(parallel=True)
+    def squared(values: np.ndarray) -> None:
+        for index in compiled.prange(len(values)):
+            values[index] *= values[index]
+
+    squared(np.ones(2))
     assert numba.threading_layer() == "omp"
     assert os.environ["OMP_WAIT_POLICY"] == "passive"
 
 
+@pytest.mark.slow
 def test_numbas_own_functions_are_compiled_with_a_kernel_and_not_to_load_one() -> None:
     """What a command loads from disk is whole; LLVM's optimiser takes 30 MB more."""
     code = (
@@ -405,6 +410,7 @@ if sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_what_kernels_alone_call_is_in_the_code_of_each_that_calls_it(tmp_path: Path) -> None:
     """Compiled with its first caller, loaded with it from disk, and loaded for another one."""
     (tmp_path / "linked.py").write_text(LINKED)

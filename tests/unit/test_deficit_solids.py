@@ -85,7 +85,7 @@ def found_in(name: str) -> tuple[Scan, AnomalyMap, Deficit]:
 @pytest.mark.parametrize("with_normals", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "name",
-    draws(["ball", "notch", "worn edge", "corner", "pit"], "notch", "worn edge"),
+    draws(["ball", "notch", "worn edge", "corner", "pit"], "worn edge"),
 )
 def test_a_cut_in_a_whole_part_cloud(name: str, with_normals: bool) -> None:
     built = BLOCK.body - CUTS[name]
@@ -107,7 +107,7 @@ def test_a_cut_in_a_whole_part_cloud(name: str, with_normals: bool) -> None:
     [ABOVE, pytest.param(BOTH_SIDES, marks=pytest.mark.slow)],
     ids=["above", "both sides"],
 )
-@pytest.mark.parametrize("name", draws(["corner", "pit", "void"], "pit", "void"))
+@pytest.mark.parametrize("name", draws(["corner", "pit", "void"], "pit"))
 def test_a_cut_seen_by_known_sensors(name: str, sensors: np.ndarray) -> None:
     cut = CUTS.get(name, cube((20, 10, 0.6), (10, 10, 9.4)))
     built = BLOCK.body - cut
@@ -117,6 +117,7 @@ def test_a_cut_seen_by_known_sensors(name: str, sensors: np.ndarray) -> None:
     assert found.missing_mm3 == pytest.approx(true_mm3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_lost_pin_is_found_by_rays_alone() -> None:
     built = PIN.body - cube((4, 5, 13), (45.5, 4.5, -0.5))
     found = deficit_of(rays(built, ABOVE), PIN)
@@ -128,6 +129,7 @@ def test_a_gap_in_a_thin_wall_by_rays() -> None:
     assert found.missing_mm3 == pytest.approx(76.8, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_gap_in_a_thin_wall_in_a_bare_cloud() -> None:
     """0.8 mm never reads deeper than 0.4, and nobody said which way its broken ends face."""
     found = deficit_of(cloud(WALL.body - cube((12, 3, 12), (15, 9, 3))), WALL)
@@ -145,6 +147,7 @@ def test_a_fin_of_one_bead_goes_with_what_it_hung_on_in_a_bare_cloud() -> None:
     assert deficit_of(cloud(built), part).missing_mm3 == pytest.approx(true_mm3, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_tenth_of_a_millimetre_over_a_wide_area() -> None:
     """Under-extrusion below every single point's threshold, with an exact template."""
     built = BLOCK.body - cube((20, 10, 0.15), (10, 10, 9.85))
@@ -181,7 +184,7 @@ def test_regions_that_detection_found_are_measured_by_solids(name: str) -> None:
 
 def test_a_crumb_beside_a_region_is_a_part_of_it() -> None:
     # regression: beside dents of a real scan stood voids of 0.1 to 0.3 mm³ that nothing had tested
-    _, anomaly, deficit = found_in("notch")
+    _, anomaly, deficit = found_in("pit")
     beside = anomaly.regions[0].box_mm[1] + 0.8
     crumb = replace(deficit.regions[0], volume_mm3=0.2, box_mm=np.array([beside, beside + 0.5]))
     (region,) = measured_regions(anomaly, replace(deficit, regions=(*deficit.regions, crumb)))
@@ -190,6 +193,7 @@ def test_a_crumb_beside_a_region_is_a_part_of_it() -> None:
     assert region.p_value == anomaly.regions[0].p_value
 
 
+@pytest.mark.slow
 def test_a_region_without_a_solid_keeps_what_its_surface_told() -> None:
     scan = cloud(BLOCK.body - CUTS["corner"] - CUTS["notch"])
     anomaly = detect(scan, BLOCK)
@@ -319,6 +323,7 @@ def test_unseen_cells_are_solid_for_the_nozzle() -> None:
     assert (field.z_mm[dark & around] >= 10.0).all()
 
 
+@pytest.mark.slow
 def test_the_same_scan_gives_the_same_solid() -> None:
     scan, *_, found = found_in("pit")
     first, second = (each.missing.to_mesh64() for each in (found, deficit_of(scan, BLOCK)))

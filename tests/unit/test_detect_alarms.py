@@ -180,6 +180,7 @@ def bar_on_bed(curl_mm: float, low_mm: float, dent_mm: float, seed: int) -> Scan
     return Scan(points + noise, SIGMA_MM, "template")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_ends_that_curl_are_nothing_too_much_and_a_layer_that_lacks_is_missing(seed: int) -> None:
     # regression: the ends of a clean plate of 158 mm, which had curled by 0.15 mm, were told as
@@ -223,6 +224,7 @@ def test_a_bed_that_a_real_scanner_sees_is_no_excess(seed: int) -> None:
     assert all((np.abs(r.box_mm.mean(axis=0)[:2] - (-7, 14)) < 2.0).all() for r in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_noise_that_is_not_normal_says_so_itself(seed: int) -> None:
     # regression: looks of a job are judged by normal noise until its first layers have told more;
@@ -239,6 +241,7 @@ def test_noise_that_is_not_normal_says_so_itself(seed: int) -> None:
     assert len(loud.regions) <= 1
 
 
+@pytest.mark.slow
 def test_strands_that_hang_are_no_errors_where_the_bed_shows_none() -> None:
     # regression: strands of an infill laid with half of their plastic lie too low, and hang out
     # below where they were planned: low and high in a dozen places, they were taken for errors of

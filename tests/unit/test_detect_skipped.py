@@ -250,6 +250,7 @@ def test_a_point_is_in_a_line_by_its_section() -> None:
     assert one.holds(points).tolist() == [True, True, False, False, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_where_one_line_is_gone_a_shorter_stretch_of_another_is_told_too(seed: int) -> None:
     short = m3.Manifold.cube((1.3, WIDE_MM, 2 * HIGH_MM + 1.0))
@@ -325,6 +326,7 @@ def told_mm(scan: Scan, over_mm: float) -> tuple[float, float]:
     return float(length_mm[here].sum()), float(length_mm[~here].sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_of_a_scanner_that_errs_lines_are_told_over_longer_stretches(seed: int) -> None:
     # regression: with a real scanner's recorded noise no line was asked for at all, since places a

@@ -101,6 +101,7 @@ def test_without_sensors_it_is_found_by_the_end_across_the_wall(piece: str, wall
     assert found_ratio(bare(seen(tube(wall_mm) - gone)), wall_mm, gone) > 0.85
 
 
+@pytest.mark.slow
 def test_an_end_is_no_neighbour_of_the_cells_beside_it() -> None:
     """A bite of 8.5 mm³ was lost where the two were one window: they differ by more than noise."""
     gone = pieces(1.6)["bite"] ^ tube(1.6)

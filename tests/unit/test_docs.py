@@ -144,6 +144,7 @@ class Fetched(HTMLParser):
             self.found.append(str(values["href"]))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="the extra 'docs' is not installed")
 def test_it_builds_without_warnings_and_fetches_nothing(tmp_path: Path) -> None:
     done = subprocess.run(

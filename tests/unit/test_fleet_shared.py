@@ -318,6 +318,7 @@ def killed_and_stepped(judges: Judges, now_s: float) -> str:
     return said
 
 
+@pytest.mark.slow
 def test_a_desk_counts_who_judged(tmp_path: Path) -> None:
     desk = Desk(tmp_path)
     for why in ("", "", "it was late"):

@@ -109,6 +109,7 @@ def hollowed() -> tuple[Small, Stop, m3.Manifold]:
     return small, Stop(11, layer.end_line, layer.z_mm), stands.translate(PLACE_MM)
 
 
+@pytest.mark.slow
 def test_nobody_to_ask_the_run_goes_on_and_the_result_has_the_ways(
     hollowed: tuple[Small, Stop, m3.Manifold], tmp_path: Path
 ) -> None:
@@ -225,6 +226,7 @@ def test_a_finished_part_is_offered_the_ways_and_the_command_makes_the_program(
     assert job_file.with_name("rest.gcode").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_of_a_finished_part_whose_layers_lie_aside_the_first_is_told(
     hollowed: tuple[Small, Stop, m3.Manifold], job_file: Path
 ) -> None:

@@ -85,6 +85,7 @@ def test_a_defect_is_told_by_its_surface(bench: ModuleType, scene, kind: str) ->
     assert max(found, key=found.__getitem__) == kind
 
 
+@pytest.mark.slow
 def test_what_a_patch_left_is_no_clog(bench: ModuleType, scene) -> None:  # type: ignore[no-untyped-def]
     # regression: a third of a mm³ that a patch had left ended the run, the nozzle that had laid
     # the patch being said to be clogged

@@ -122,6 +122,7 @@ def test_the_layers_of_a_slim_part_are_told_by_few_patches(by_mm: tuple[float, f
     assert np.abs(np.array(found.by_mm) - by_mm).max() < 0.16
 
 
+@pytest.mark.slow
 def test_layers_are_no_farther_aside_than_views_are(box: tuple[Job, int]) -> None:
     # regression: of fins seen by a scanner whose views differ by 0.09 mm, as a real one's do, a
     # shift of 0.3 mm was told

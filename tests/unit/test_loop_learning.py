@@ -112,6 +112,7 @@ def test_normal_noise_is_told_and_changes_nothing(small: Small, tmp_path: Path) 
     assert sum(e["event"] == "learned" for e in _events(tmp_path)) == 1
 
 
+@pytest.mark.slow
 def test_where_the_bed_tells_long_tails_each_look_is_judged_by_it(
     small: Small, tmp_path: Path
 ) -> None:

@@ -126,6 +126,7 @@ def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
         locate_part(job_of(plate), template, layer_height_mm=LAYER_MM)
 
 
+@pytest.mark.slow
 def test_a_job_without_roles_is_placed_by_what_bounds_its_layers() -> None:
     """regression: Slic3r's jobs name no roles; infill was taken for walls, a skirt for a part."""
     part = wedge().transform(pose((0.0, 0.0, 0.0), 60.0, 60.0))
@@ -188,7 +189,7 @@ def hooked(holed: bool) -> m3.Manifold:
     )
 
 
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize("order", [(0, 1), pytest.param((1, 0), marks=pytest.mark.slow)])
 def test_each_thing_of_a_plate_is_of_the_template_that_it_fits(order: tuple[int, int]) -> None:
     """A job of two parts was refused: "loop over a job that prints copies of one part"."""
     parts = [hooked(holed=True), hooked(holed=False)]
@@ -207,6 +208,7 @@ def test_each_thing_of_a_plate_is_of_the_template_that_it_fits(order: tuple[int,
     assert template.solid().volume() == pytest.approx(plate.volume(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_low_part_is_found_upright_whatever_its_tops_and_bottoms_hide() -> None:
     """A washer of 0.4 mm was refused: its walls lie nearer to a flat than half a bead, and were
     held to lie 0.1 mm off. Of plates of 0.4 and 2 mm the walls told a tilt of 0.8 degrees.
@@ -307,6 +309,7 @@ def test_a_skirt_is_nothing_too_much() -> None:
     assert not plan.deficit.regions
 
 
+@pytest.mark.slow
 def test_a_part_on_a_raft_stands_where_its_beads_begin() -> None:
     """Such jobs were refused; with the raft's top taken for the bed every look was 0.5 mm off."""
     foot_mm = 0.6
@@ -344,6 +347,7 @@ def test_a_part_on_a_raft_stands_where_its_beads_begin() -> None:
             assert not plan.too_much
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", draws([range(4, 5), range(4, 7)], range(4, 5)), ids=len)
 def test_what_layers_round_up_of_a_flat_top_is_nothing_too_much(seeds: range) -> None:
     """A clean job of PrusaSlicer ended with 37 mm³ too much: its tops lay 0.05 mm over the drawing.
@@ -443,6 +447,7 @@ def test_walls_of_a_slope_lie_half_a_bead_in_along_their_layer(moved_mm: float) 
     assert (final.planned is not None) == (moved_mm != 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stretch", draws([-0.01, 0.015], -0.01))
 def test_a_job_that_is_stretched_for_what_shrinks_is_the_part_s(stretch: float) -> None:
     """regression: 0.5 % of a part of 60 mm made it another part, or laid it aside by as much."""

@@ -78,6 +78,7 @@ def test_it_is_given_up_after_two_looks_and_the_others_go_on(three: Plate, tmp_p
     assert np.array(found) == pytest.approx(np.array(wanted), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_where_somebody_can_be_asked_no_ends_the_run(three: Plate, tmp_path: Path) -> None:
     asked: list[str] = []
     report, _ = three.run(

@@ -40,6 +40,7 @@ def to_its_end(small: Small, sent: list[str]) -> bool:
     return sent.count(last) >= lines.count(last)
 
 
+@pytest.mark.slow
 def test_a_low_rise_makes_the_next_layer_thinner_there(small: Small, tmp_path: Path) -> None:
     bump = small.block(-0.05, 0.19)  # 0.03 mm over what a layer may leave
     report, sent = small.run(tmp_path, lambda n: scan_of(small.standing + bump, count=15_000))

@@ -56,6 +56,7 @@ def looked_at(
     return plan_repair(scan, site, title="x", guess=guess, strict=False)
 
 
+@pytest.mark.slow
 def test_what_a_job_leaves_open_at_its_top_is_not_missing() -> None:
     """Jobs of PrusaSlicer without top layers were filled up at their end: 110 mm³; vases whole."""
     cup = BLOCK - HOLLOW  # as slicers leave a block without top layers
@@ -226,6 +227,7 @@ def test_what_is_too_much_is_told_beside_supports(beside: str) -> None:
     assert excess.volume() < 1.3 * stands_mm3
 
 
+@pytest.mark.slow
 def test_where_an_edge_sags_nothing_is_told_of_what_nobody_saw_behind_it() -> None:
     """regression: planes of its face went on under the overhang: 17 mm³ for the 3 there."""
     leg = m3.Manifold.cube((6.0, 14.0, 5.0)).translate((90.0, 90.0, 0.0))

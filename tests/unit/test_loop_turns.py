@@ -86,6 +86,7 @@ def test_the_pace_begins_anew_with_every_object(three: InTurn) -> None:
     assert found == [x for k, own in enumerate(each, 1) for x in (*own, f"final-{k}")]
 
 
+@pytest.mark.slow
 def test_every_copy_is_found_where_its_turn_prints_it(three: InTurn) -> None:
     (part, *_) = getattr(three.template, "parts")  # noqa: B009 - of the port nobody knows it
     placed = locate_parts(three.job, part, layer_height_mm=0.2)

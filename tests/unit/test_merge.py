@@ -102,6 +102,7 @@ def test_normals_point_outwards_also_in_the_hole(part: AnalyticTemplate) -> None
     assert (agree[hole] > 0).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_both_sides_of_a_thin_wall_are_told_apart() -> None:
     """A duct with walls of 1.5 mm, points a millimetre apart: planes, sides, and the noise."""
     duct = difference(box((0, 0, 0), (50, 26, 20)), box((-1, 1.5, 1.5), (51, 24.5, 18.5)))
@@ -179,6 +180,7 @@ def test_a_defect_of_one_scan_is_outvoted(part: AnalyticTemplate) -> None:
     assert np.linalg.norm(fused.outvoted_at_mm[2] - spot) < 3.0
 
 
+@pytest.mark.slow
 def test_where_normal_parts_differ_the_spread_says_so(part: AnalyticTemplate) -> None:
     clouds = [points_of(part, 20_000, s) for s in range(4)]
     for cloud, lift in zip(clouds, (-0.15, -0.05, 0.05, 0.15), strict=True):

@@ -83,6 +83,7 @@ def test_a_level_face_that_both_see_holds_the_height() -> None:
     assert max(slack.sigma_mm for slack in found) < SIGMA_MM
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", draws([range(3), range(8)], range(3)), ids=len)
 def test_what_is_said_of_poses_is_true(seeds: range) -> None:
     """Draws of noise, points and start: errors across the surface over what is said."""

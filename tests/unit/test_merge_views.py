@@ -190,6 +190,7 @@ def graph_of(views: list[View], poses: dict[tuple[int, int], list[np.ndarray]]) 
     return graph
 
 
+@pytest.mark.slow
 def test_a_wrong_pair_is_outvoted_by_the_cycle(bracket: Shape) -> None:
     """Three views about a corner; between two of them the only proposal is a wrong pose."""
     views = views_at(bracket, (1.0, 0.2, 0.7), (0.4, 1.0, 0.7), (0.9, 0.7, 0.5), count=30_000)
@@ -238,6 +239,7 @@ def test_where_a_sensor_stood_is_among_the_guesses(
     assert not looks.free(inside, 0.5).any()
 
 
+@pytest.mark.slow
 def test_a_whole_scan_is_no_view(bracket: Shape) -> None:
     points = sample_shape(bracket, 8_000, np.random.default_rng(0)).points_mm
     assert len(guess_directions(points)) == 0
@@ -302,6 +304,7 @@ def test_views_that_fit_in_more_than_one_way_are_refused_with_advice() -> None:
         placed([scan for scan, _ in made])
 
 
+@pytest.mark.slow
 def test_views_in_one_frame_stay_as_they_came() -> None:
     """The same ring, exported in one frame: nothing to find, and no pose mistaken."""
     shape = shape_of(Manifold.cylinder(12.0, 10.0, 10.0, 6))

@@ -121,6 +121,7 @@ def test_half_of_a_frame_leaves_an_edge_far_shorter_than_around_what_it_took() -
     assert (missing ^ rest).volume() < 0.01 * rest.volume()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(DATA is None, reason="AMREPAIR_DATA is not set")
 def test_broken_surface_that_faced_the_wrong_way_at_first_is_tried_the_other_way() -> None:
     # regression: only what faced no way yet was tried, so that most of what was seen of a slanting

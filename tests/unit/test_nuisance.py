@@ -266,6 +266,7 @@ def test_one_side_seen_by_one_view_is_explained_by_the_sum() -> None:
     assert found.view_offset_mm.shape == (1,)
 
 
+@pytest.mark.slow
 def test_a_part_laid_elsewhere_answers_the_same() -> None:
     seen = Seen(PLATE, lambda p: bowed(0.6, 150.0)(p) + scaled(-0.006)(p))
     found = seen.fit()
@@ -285,6 +286,7 @@ def test_a_part_laid_elsewhere_answers_the_same() -> None:
     assert again.frame.half_extent_mm == pytest.approx(found.frame.half_extent_mm, abs=1.0)
 
 
+@pytest.mark.slow
 def test_the_standard_error_is_as_large_as_the_error() -> None:
     off = []
     for seed in range(12):

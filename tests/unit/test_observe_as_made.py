@@ -111,6 +111,7 @@ def test_a_dent_in_a_ball_of_another_size_is_whole(ratio: float, depth_mm: float
     assert deficit_of(made - cut, BALL).missing_mm3 == pytest.approx(lost_mm3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_pit_in_a_part_too_large_is_whole_where_sensors_are_known() -> None:
     made = scaled(BOX, 0.008)
     cut = manifold3d.Manifold.cylinder(6, 6, 6, 96).translate((10.0, 0.0, 22.0))

@@ -195,6 +195,7 @@ def test_a_cut_in_a_bare_view_with_a_silhouette_is_measured() -> None:
     assert (deficit.missing ^ gone).volume() > 0.85 * gone.volume()
 
 
+@pytest.mark.slow
 def test_what_is_hidden_is_no_void_behind_a_few_strays() -> None:
     """Regression: a dozen stray points, and half a plate that nobody saw was 7,131 mm³ missing."""
     size = np.array([80.0, 60.0, 4.0])

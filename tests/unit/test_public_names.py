@@ -67,6 +67,7 @@ def test_importing_loads_nothing_heavy() -> None:
     assert not HEAVY & set(json.loads(done.stdout))
 
 
+@pytest.mark.slow
 def test_from_scan_to_program_neither_torch_nor_open3d_is_loaded() -> None:
     code = (
         "import sys, amrepair, gcode\n"

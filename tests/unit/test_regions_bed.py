@@ -96,6 +96,7 @@ def test_what_lies_on_the_bed_is_no_error_of_the_scanners() -> None:
     assert told(points) == NORMAL_BY_BED
 
 
+@pytest.mark.slow
 def test_errors_that_hang_together_are_told_by_how_far_windows_wander() -> None:
     points = bed(0)
     ways = np.random.default_rng(3).normal(0.0, 1.0 / 4.0, (200, 2))

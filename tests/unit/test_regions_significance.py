@@ -137,6 +137,7 @@ def test_as_normal_is_as_rare_as_student_s_t() -> None:
     assert as_normal(np.array([-np.inf]), freedom[:1])[0] == -np.inf
 
 
+@pytest.mark.slow
 def test_a_small_scan_tells_its_wander_less_surely_than_a_large_one(ball: AnalyticTemplate) -> None:
     """As places 10 mm apart, of which a ball of 30 mm has some 110 and one of 10 mm some 12."""
     small = sphere((0, 0, 0), 10.0)
@@ -153,6 +154,7 @@ def test_a_small_scan_tells_its_wander_less_surely_than_a_large_one(ball: Analyt
     assert usual[0] > 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_defect_of_many_pieces_is_not_taken_for_errors_of_the_scan(seed: int) -> None:
     """A comb's six teeth are worn together: on tops and flanks they show in a dozen places."""
@@ -193,6 +195,7 @@ def test_few_peaks_tell_a_tail_less_surely_than_many() -> None:
         assert np.exp(tail.log_expected(z)[0]) == pytest.approx(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("told_by", [6, 30])
 def test_what_few_places_tell_to_lie_far_off_is_exceeded_as_often_as_it_says(told_by: int) -> None:
     """Depths of normal errors, their spread estimated from so few: 400,000 draws of it."""
@@ -268,6 +271,7 @@ def test_scales_do_not_mix_the_sides_of_a_thin_wall() -> None:
         assert scale.median_mm[back] == pytest.approx(0.0)
 
 
+@pytest.mark.slow
 def test_a_calibration_is_kept_by_name_and_read_again(
     ball: AnalyticTemplate, tmp_path: Path
 ) -> None:

@@ -270,6 +270,7 @@ def test_same_data_same_bytes(data: ReportData, tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "b.html"]
 
 
+@pytest.mark.slow
 def test_half_a_million_points_stay_in_budget_and_it_is_said() -> None:
     page = render_report(example(500_000))
     assert len(page.encode()) < 15e6

@@ -60,6 +60,7 @@ def slab(x: tuple[float, float], lines: tuple[int, int], low_mm: float) -> m3.Ma
     return m3.Manifold.cube(size).translate((X0 + x[0], Y0 + lines[0] * WIDE_MM, low_mm))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_columns_beside_lines_are_those_that_shapes_hold(seed: int) -> None:

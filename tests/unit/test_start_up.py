@@ -75,6 +75,7 @@ def test_a_check_loads_nothing_that_scans_meshes_or_sends(tmp_path: Path) -> Non
     assert loaded_by("gcode check job.gcode", folder=tmp_path) <= needed
 
 
+@pytest.mark.slow
 def test_sending_over_a_cable_loads_nothing_of_the_web(tmp_path: Path) -> None:
     loaded = loaded_by("gcode send job.gcode --port file:out.gcode", folder=tmp_path)
     assert not loaded & {"httpx", "websockets", "trimesh", "torch", "open3d", "shapely"}

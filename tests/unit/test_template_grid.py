@@ -130,6 +130,7 @@ def test_the_cache_is_used_and_survives_damage(tmp_path: Path) -> None:
     assert load_or_fit(box, cache_dir=tmp_path).bias_mm == first.bias_mm
 
 
+@pytest.mark.slow
 def test_a_file_that_is_known_is_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -95,6 +95,7 @@ def test_one_defective_scan_does_not_enter_and_is_named(drawn: GridSdf) -> None:
     assert found[0][1] > 0.8
 
 
+@pytest.mark.slow
 def test_what_no_scan_saw_stays_as_it_was_drawn(drawn: GridSdf) -> None:
     half = [p[p[:, 0] < 0] for p in (printed(seed) for seed in range(3))]
     learned, sound = learn(drawn, half)
@@ -105,6 +106,7 @@ def test_what_no_scan_saw_stays_as_it_was_drawn(drawn: GridSdf) -> None:
     assert (sound.scans[sound.sites.place_mm[:, 0] > 3] == 0).all()
 
 
+@pytest.mark.slow
 def test_two_sides_of_a_thin_wall_learn_apart() -> None:
     wall = trimesh.creation.box(extents=(30.0, 0.8, 20.0))
     template = fit_fast(MeshSdf.from_mesh(wall), seed=0, options=SMALL_FIT)

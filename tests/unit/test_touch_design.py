@@ -203,6 +203,7 @@ def clean_regions(run: PreparedRun, site: Site, stop: Stop, seeds: range) -> int
     return count
 
 
+@pytest.mark.slow
 def test_sound_layers_raise_nothing(run: PreparedRun, stop: Stop, site: Site) -> None:
     assert clean_regions(run, site, stop, range(6)) == 0
 

@@ -99,6 +99,7 @@ def test_points_that_stray_to_where_surface_was_hold_nothing_there() -> None:
     assert deficit.missing_mm3 == pytest.approx(gone.volume(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_what_takes_most_of_a_top_along_is_gone_and_not_hidden() -> None:
     # regression: most surface that faces up was not seen, so what had been of it over the pit
     # counted as hidden; a patch of wall without points made a guess of all beside it (0.93 found)
@@ -113,6 +114,7 @@ def test_what_takes_most_of_a_top_along_is_gone_and_not_hidden() -> None:
     assert (deficit.missing ^ gone).volume() > 0.98 * gone.volume()
 
 
+@pytest.mark.slow
 def test_a_patch_without_points_hides_no_more_than_it_is_wide() -> None:
     # regression: all that lies nearer to it than to scanned surface was a guess (0.95 found)
     whole = m3.Manifold.cube((20.0, 14.0, 6.0))
