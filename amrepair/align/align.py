@@ -10,15 +10,16 @@ from jaxtyping import Float
 
 from amrepair.align.anywhere import Found, explained_if_mirrored, pose_from_anywhere
 from amrepair.align.bed import bed_prior, level_on_bed
+from amrepair.align.level import is_level
 from amrepair.align.options import DEFAULT_ALIGN, AlignOptions
 from amrepair.align.pam import align_paper
 from amrepair.align.poses import explained
-from amrepair.align.refine import Prior, Refined, refine, refine_all
+from amrepair.align.refine import Prior, Refined, refine
 from amrepair.align.registration import Registration
 from amrepair.align.sizes import other_size, refuse_other_size
-from amrepair.align.standing import stood_up
+from amrepair.align.standing import box_on_bed, stood_up
 from amrepair.align.thinning import in_order, thin_out
-from amrepair.arrays import Mask, Matrix, Points
+from amrepair.arrays import Mask, Matrix, Points, Vector
 from amrepair.errors import AlignmentError, InputError, PartMovedError
 from amrepair.frames import Transform, in_box, moved, turned_rad
 from amrepair.scans import Scan
@@ -126,14 +127,12 @@ def align(
             f"the guess starts from frame {guess.source}, the scan {scan.source} is in {scan.frame}"
         )
     sigma_mm, inlier_mm = options.explained.limits_mm(scan.sigma_mm)
-    refined, as_wide = _from_guess(scan, template, so_far, aside, guess, sigma_mm, options, rng)
+    refined, points_mm = _from_guess(scan, template, so_far, aside, guess, sigma_mm, options, rng)
     progress("align", 1.0, 1.0)
     ratio = explained(refined, inlier_mm)
     least = options.guess.least_explained
-    # what lies in the part is missing of it: only what stands out of it speaks for another
-    stands_out = float((refined.residual_mm > inlier_mm).mean())
-    if as_wide and stands_out <= 1.0 - options.least_of_rest:
-        least = options.guess.least_if_within
+    if ratio < least and _is_stopped(refined, points_mm, inlier_mm, options):
+        least = 0.0
     _refuse_misfit(scan, refined, ratio, inlier_mm, least, "")
     answer = Found(refined, (), ratio, scan.points_mm, 0.0, sigma_mm, inlier_mm)
     return _registration(scan, answer, options)
@@ -169,7 +168,7 @@ def _from_anywhere(
     """From any pose; a mirror image and too little of the part are refused."""
     least = options.least_of_known if part_is_known else options.least_explained
     found = pose_from_anywhere(
-        scan.points_mm,
+        _over_bed(scan, options),
         template,
         sigma_mm=scan.sigma_mm,
         options=options,
@@ -200,14 +199,94 @@ def _from_anywhere(
     if in_surroundings:
         _refuse_standing_out(scan, found, 1.0 - options.least_of_rest, sizes)
     if options.stands_upright:  # it is this part, however it stands
+        found = _as_drawn(found, template, options, rng)
         points = in_order(thin_out(found.part_mm, options.poses.dense_points, rng))
-        best = _as_it_stands(points, template, found.best, found.sigma_mm, options)
+        anywhere_mm = np.full(3, options.guess.bound_mm)
+        best = _as_it_stands(points, template, found.best, anywhere_mm, found.sigma_mm, options)
+        best = _on_its_bed(scan, points, template, best, found.sigma_mm, options)
         if best is not found.best:
             moved_by = np.linalg.inv(found.best.matrix) @ best.matrix
             others = tuple(other @ moved_by for other in found.others)
             ratio = explained(best, found.inlier_mm)
             found = replace(found, best=best, others=others, explained_ratio=ratio)
     return _registration(scan, found, options)
+
+
+def _over_bed(scan: Scan, options: AlignOptions) -> Points:
+    """A scan's points without the bed, which in the printer's own frame is known to be at Z = 0."""
+    if not options.stands_upright:
+        return scan.points_mm
+    over = scan.points_mm[:, 2] > options.guess.above_bed_mm
+    return scan.points_mm[over] if over.sum() >= options.clutter.least_left else scan.points_mm
+
+
+def _as_drawn(
+    found: Found, template: Template, options: AlignOptions, rng: np.random.Generator
+) -> Found:
+    """Of a symmetric part's poses that fit alike, the one that stands as it was drawn."""
+    upright = [k for k, other in enumerate(found.others) if _is_upright(other, options)]
+    if not upright or _is_upright(found.best.matrix, options):
+        return found
+    others = [*found.others]
+    best = _finished(others.pop(upright[0]), found, template, options, rng)
+    return replace(found, best=best, others=(found.best.matrix, *others))
+
+
+def _finished(
+    matrix: Matrix,
+    found: Found,
+    template: Template,
+    options: AlignOptions,
+    rng: np.random.Generator,
+) -> Refined:
+    """Another of the poses that were found, refined as the best one was."""
+    scale_mm = options.poses.scale_mm(found.sigma_mm)
+    return refine(
+        in_order(thin_out(found.part_mm, options.poses.dense_points, rng)),
+        template,
+        matrix,
+        start_scale_mm=scale_mm,
+        end_scale_mm=scale_mm,
+        sigma_mm=found.sigma_mm,
+    )
+
+
+def _on_its_bed(
+    scan: Scan,
+    points_mm: Points,
+    template: Template,
+    best: Refined,
+    sigma_mm: float,
+    options: AlignOptions,
+) -> Refined:
+    """The pose with the part's foot on the bed, where the bed was seen or the part was sunk in it.
+
+    A print that stopped early fits its template as well where it is sunk until the tops agree.
+    """
+    if not _is_upright(best.matrix, options):
+        return best
+    shift = np.eye(4)  # up to the bed, in the scan's frame
+    shift[2, 3] = -max(0.0, -_foot_mm(template, best.matrix))
+    stood, on_bed = level_on_bed(scan.points_mm, template, best.matrix @ shift, options.bed)
+    if not on_bed and shift[2, 3] == 0.0:
+        return best
+    scale_mm = options.poses.scale_mm(sigma_mm)
+    known = _guess_prior(stood, on_bed, options)
+    return refine(
+        points_mm,
+        template,
+        stood,
+        start_scale_mm=scale_mm,
+        end_scale_mm=scale_mm,
+        sigma_mm=sigma_mm,
+        prior=replace(known, rotation_rad=np.full(3, options.bed.tilt_sigma_rad)),
+        max_iterations=options.guess.most_steps,
+    )
+
+
+def _foot_mm(template: Template, matrix: Matrix) -> float:
+    """How high over the bed a pose, template from build, puts the lowest of a part."""
+    return float(box_on_bed(template, Transform("template", "build", matrix).inverse())[0, 2])
 
 
 def _as_it_was_seen(
@@ -235,25 +314,23 @@ def _as_it_was_seen(
     if not is_possible(best.matrix):
         if not others:  # then it is the sensors' places that are wrong
             return found
-        scale_mm = options.poses.scale_mm(found.sigma_mm)
-        best = refine(
-            in_order(thin_out(found.part_mm, options.poses.dense_points, rng)),
-            template,
-            others.pop(0),
-            start_scale_mm=scale_mm,
-            end_scale_mm=scale_mm,
-            sigma_mm=found.sigma_mm,
-        )
+        best = _finished(others.pop(0), found, template, options, rng)
         ratio = explained(best, found.inlier_mm)
     return replace(found, best=best, others=tuple(others), explained_ratio=ratio)
 
 
 def _as_it_stands(
-    points_mm: Points, template: Template, leaning: Refined, sigma_mm: float, options: AlignOptions
+    points_mm: Points,
+    template: Template,
+    leaning: Refined,
+    shift_mm: Vector,
+    sigma_mm: float,
+    options: AlignOptions,
 ) -> Refined:
     """Upright, unless a lean explains far more at the scale of the noise.
 
-    Layers that lie aside of those below look like a part that leans, which fits neither of them.
+    Layers that lie aside of those below look like a part that leans, which fits neither of them;
+    and so do tops that lie too low, which say nothing of a lean.
     """
     centre = moved(points_mm.mean(axis=0)[None], leaning.matrix)[0]
     most_rad = np.deg2rad(options.guess.bound_deg)
@@ -263,7 +340,7 @@ def _as_it_stands(
         return leaning
     scale_mm = options.poses.scale_mm(sigma_mm)
     # it leans about some place of its own: at first all but the turn is found again
-    as_turned = Prior(np.full(3, options.bed.tilt_sigma_rad), np.full(3, options.guess.bound_mm))
+    as_turned = Prior(np.full(3, options.bed.tilt_sigma_rad), shift_mm)
     stands = refine(
         points_mm,
         template,
@@ -273,17 +350,25 @@ def _as_it_stands(
         sigma_mm=sigma_mm,
         prior=as_turned,
     )
-    both = refine_all(
-        points_mm,
-        template,
-        [leaning.matrix, stands.matrix],
-        start_scale_mm=scale_mm,
-        end_scale_mm=scale_mm,
-        sigma_mm=sigma_mm,
+    free = Prior(np.full(3, most_rad), shift_mm)
+    tilt_rad = options.bed.tilt_sigma_rad if _is_upright(stands.matrix, options) else most_rad
+    held = Prior(np.array([tilt_rad, tilt_rad, most_rad]), shift_mm)
+    leans, stands = (
+        refine(
+            points_mm,
+            template,
+            start.matrix,
+            start_scale_mm=scale_mm,
+            end_scale_mm=scale_mm,
+            sigma_mm=sigma_mm,
+            prior=prior,
+        )
+        for start, prior in ((leaning, free), (stands, held))
     )
-    leaning_loss, upright_loss = (one.loss(scale_mm) for one in both)
-    is_lean = leaning_loss < options.lean_believed * upright_loss
-    return leaning if is_lean or not both[1].converged else both[1]
+    inlier_mm = options.explained.limits_mm(sigma_mm)[1]
+    tells = ~_is_low_top(points_mm, stands, inlier_mm, options)
+    is_lean = leans.loss(scale_mm, tells) < options.lean_believed * stands.loss(scale_mm, tells)
+    return leaning if is_lean or not stands.converged else stands
 
 
 def _refuse_mirrored(
@@ -359,8 +444,8 @@ def _from_guess(
     sigma_mm: float,
     options: AlignOptions,
     rng: np.random.Generator,
-) -> tuple[Refined, bool]:
-    """The pose, and whether what is seen of the part is as wide in X and Y as it is."""
+) -> tuple[Refined, Points]:
+    """The pose, and the points that it was found by."""
     least, most = options.least_points, options.poses.dense_points
     bound_mm, bound_deg = options.guess.bound_mm, options.guess.bound_deg
     levelled, on_bed = guess.matrix, False
@@ -379,8 +464,7 @@ def _from_guess(
         )
     points = points[:: -(-len(points) // (4 * most))]
     points = in_order(thin_out(points, most, rng))
-    wide = Prior(np.full(3, np.deg2rad(bound_deg)), np.full(3, bound_mm))
-    prior = bed_prior(np.deg2rad(bound_deg), bound_mm, options.bed) if on_bed else wide
+    prior = _guess_prior(levelled, on_bed, options)
     expected = template if so_far is None else so_far.planned
     found = refine(
         points,
@@ -393,7 +477,7 @@ def _from_guess(
         max_iterations=options.guess.most_steps,
     )
     if options.stands_upright:
-        found = _as_it_stands(points, expected, found, sigma_mm, options)
+        found = _as_it_stands(points, expected, found, prior.translation_mm, sigma_mm, options)
     away = found.matrix @ np.linalg.inv(guess.matrix)
     centre = points.mean(axis=0) @ guess.matrix[:3, :3].T + guess.matrix[:3, 3]
     moved_mm = float(np.linalg.norm(away[:3, :3] @ centre + away[:3, 3] - centre))
@@ -404,9 +488,44 @@ def _from_guess(
             f"{turned_deg:.2f}° away from where it should be (limits {bound_mm:g} mm and "
             f"{bound_deg:g}°); the part has come off and moved, or the calibration is wrong"
         )
-    wide_mm = np.ptp(np.quantile(moved(points, found.matrix), [0.01, 0.99], axis=0), axis=0)
-    whole_mm = np.ptp(expected.bounds_mm, axis=0)
-    return found, bool((wide_mm >= options.guess.as_wide * whole_mm)[:2].all())
+    return found, points
+
+
+def _guess_prior(matrix: Matrix, on_bed: bool, options: AlignOptions) -> Prior:
+    """How far a pose may be off its guess; of what stands on its bed the height is known better."""
+    turn_rad, shift_mm = np.deg2rad(options.guess.bound_deg), options.guess.bound_mm
+    if on_bed:
+        return bed_prior(turn_rad, shift_mm, options.bed)
+    wide = Prior(np.full(3, turn_rad), np.full(3, shift_mm))
+    if not options.stands_upright or not _is_upright(matrix, options):
+        return wide
+    return replace(wide, translation_mm=np.array([shift_mm, shift_mm, options.bed.frame_sigma_mm]))
+
+
+def _is_upright(matrix: Matrix, options: AlignOptions) -> bool:
+    """Whether the template's Z is the scan's."""
+    return bool(matrix[2, 2] > np.cos(np.deg2rad(options.guess.bound_deg)))
+
+
+def _is_stopped(found: Refined, points_mm: Points, inlier_mm: float, options: AlignOptions) -> bool:
+    """Whether what lies in the part is the tops of its layers, and its walls are the part's.
+
+    A print may have stopped at any height, and its layers may lie too low; where a wall of it
+    stands, no layer moves.
+    """
+    if (found.residual_mm > inlier_mm).mean() > 1.0 - options.least_of_rest:
+        return False
+    on = int((np.abs(found.residual_mm) <= inlier_mm).sum())
+    judging = int((~_is_low_top(points_mm, found, inlier_mm, options)).sum())
+    return on >= max(options.least_points, options.guess.least_of_walls * judging)
+
+
+def _is_low_top(points_mm: Points, found: Refined, inlier_mm: float, options: AlignOptions) -> Mask:
+    """(n,) points that lie in the part and on a level surface."""
+    low = found.residual_mm < -inlier_mm
+    placed = moved(points_mm, found.matrix)
+    low[low] = is_level(placed, np.flatnonzero(low), options.level)
+    return low
 
 
 def _part_only(

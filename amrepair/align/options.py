@@ -390,6 +390,8 @@ class BedOptions:
         Of the robust plane: the loss's scale begins at the band.
     height_sigma_mm, tilt_sigma_rad
         What the bed leaves open: a few micrometres of height, and tilt over a part's length.
+    frame_sigma_mm
+        What the printer's own frame leaves open of the bed's height where a scan does not show it.
     """
 
     most_points: int = 80_000
@@ -404,6 +406,23 @@ class BedOptions:
     last_scale_mm: float = 0.1
     height_sigma_mm: float = 0.01
     tilt_sigma_rad: float = 2e-4
+    frame_sigma_mm: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class LevelOptions:
+    """What is a level surface, as the top of a layer.
+
+    Attributes
+    ----------
+    steepest_deg
+        Of a layer's top, as of a plane through a point and its neighbours.
+    neighbours
+        That the plane goes through, the point among them.
+    """
+
+    steepest_deg: float = 45.0
+    neighbours: int = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,11 +444,10 @@ class GuessOptions:
         Where walls were laid too narrow or too low, both of their sides lie inside, and the pose
         slides slowly along a shallow valley between them: looks that 60 steps had ended took 61 to
         97.
-    least_explained, least_if_within, as_wide
+    least_explained, least_of_walls
         Much of what is seen may be bed. Where no more stands out of the part than may
-        (`least_of_rest`), and what is seen is as wide as it is (this share in X and in Y), the rest
-        lies in it, as where layers were laid with half of their plastic: then its walls alone need
-        to fit. Of 364 scans of other parts none passed by that.
+        (`least_of_rest`), the tops of layers that lie in it say nothing, as where it stopped early
+        or was laid with half of its plastic: then this share of all else needs to fit.
     """
 
     bound_mm: float = 3.0
@@ -440,8 +458,7 @@ class GuessOptions:
     start_scale_mm: float = 1.0
     most_steps: int = 240
     least_explained: float = 0.5
-    least_if_within: float = 0.2
-    as_wide: float = 0.9
+    least_of_walls: float = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -559,7 +576,7 @@ class AlignOptions:
         Sizes that differ by more are worth a word.
     sight_points
         That tell whether the sensors could have seen the part in a pose.
-    guess, coarse, poses, explained, families, clutter, bed
+    guess, coarse, poses, explained, families, clutter, bed, level
         Of each stage.
     paper
         Of the published method.
@@ -586,6 +603,7 @@ class AlignOptions:
     families: FamilyOptions = field(default_factory=FamilyOptions)
     clutter: ClutterOptions = field(default_factory=ClutterOptions)
     bed: BedOptions = field(default_factory=BedOptions)
+    level: LevelOptions = field(default_factory=LevelOptions)
     paper: PamOptions = PUBLISHED_PAM
 
 

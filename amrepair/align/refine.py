@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from amrepair.align import refine_kernels as kernels
-from amrepair.arrays import Matrix, Points, Values, Vector
+from amrepair.arrays import Mask, Matrix, Points, Values, Vector
 from amrepair.frames import nearest_rotation, rigid
 from amrepair.template.port import Distances, OnGrid
 
@@ -60,9 +60,9 @@ class Refined:
     converged: bool
     iterations: int
 
-    def loss(self, scale_mm: float) -> float:
-        """Mean Geman–McClure loss of the points at a scale, from 0 to 1."""
-        square = np.square(self.residual_mm)
+    def loss(self, scale_mm: float, which: Mask | slice = slice(None)) -> float:
+        """Mean Geman–McClure loss of the points, or of some, at a scale, from 0 to 1."""
+        square = np.square(self.residual_mm[which])
         return float((square / (square + scale_mm**2)).mean())
 
 

@@ -20,6 +20,7 @@ from amrepair.frames import Transform
 from amrepair.library import recognise
 from amrepair.regions import AnomalyMap, Region, detect
 from amrepair.repair import Site, plan_repair
+from amrepair.repair.other_part import refuse_other_part
 from amrepair.scans import Scan, read_scan
 from amrepair.template import open_template
 from gcode.compiled import set_num_threads
@@ -131,6 +132,8 @@ class Bench:
             return pose, {}
         placed = scan.moved(found.template_from_scan)
         anomaly = detect(placed, held.template, calibration=self._work.calibration)
+        if not options.part_is_known:
+            refuse_other_part(anomaly, held.template, scan.source)
         here = Transform.identity("build", "template")
         deficit = compute_deficit(placed, held.template, anomaly, build_from_template=here)
         regions = measured_regions(anomaly, deficit)

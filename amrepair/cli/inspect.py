@@ -228,6 +228,7 @@ def detect(
         from amrepair.frames import Transform
         from amrepair.regions import detect as detect_defects
         from amrepair.repair import Stopwatch
+        from amrepair.repair.other_part import refuse_other_part
         from amrepair.report.collect import rounded
         from amrepair.report.folder import RunFolder
 
@@ -241,6 +242,8 @@ def detect(
         with watch("detect"):
             anomaly = detect_defects(placed, field, calibration=known_errors, progress=bars)
         _refuse_too_noisy(anomaly, smallest_mm, scan)
+        if not part_is_known:
+            refuse_other_part(anomaly, field, cloud.source)
         with watch("measure"):
             in_place = Transform.identity("build", "template")
             solids = replace(DEFAULT_DEFICIT, early_mm3=np.inf)  # nobody asks what stands there

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from amrepair.cli.files import read_early
-from amrepair.cli.inspect import KnownOption, TemplateOption
+from amrepair.cli.inspect import KnownOption
 from amrepair.cli.options import (
     CalibrationOption,
     SeedOption,
@@ -68,7 +68,14 @@ SAME_AS_BED_MM = 0.15
 )
 def repair(
     scan: Annotated[Path, typer.Argument(help="Scan of the damaged part, mm.")],
-    template: TemplateOption,
+    template: Annotated[
+        Path,
+        typer.Option(
+            "--template",
+            help="Template file, or the part's mesh; with --part-pose job a folder of them, one of "
+            "each part that the job prints.",
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Repair program to write.")],
     printer: JobPrinterOption = None,
     material: JobMaterialOption = None,
@@ -129,6 +136,7 @@ def repair(
 ) -> None:
     """Make the G-code that prints only what is missing on a finished part."""
     _refuse_contradicting_words(scan_frame, pose, job)
+    _refuse_plate_without_job(template, pose)
     damage_at_mm = _damage_at(damage_at, scan_frame)
     text = program_text(job) if job is not None else None
     chosen = chosen_setup(text, job or "", printer, material, process)
@@ -176,6 +184,8 @@ def repair(
                 watch=watch,
                 progress=bars,
             )
+        if plan.too_much and where.job_with_supports is not None:
+            console.errors.print(f"{_lays_more(where.job_with_supports)}.")
         ranked: tuple[Reorientation, ...] = ()
         if turns and plan.unreachable_mm3 > WORTH_TURNING_RATIO * plan.deficit.missing_mm3:
             with watch("turns"):
@@ -184,7 +194,8 @@ def repair(
         if read_job is not None:
             with watch("ways"):
                 command = _that_goes_on(f"{job}", output, printer, material)
-                late = afterwards(plan, read_job, field, setup, command=command)
+                at = site.build_from_template if template.is_dir() else None
+                late = afterwards(plan, read_job, field, setup, command=command, printed_at=at)
     older = _save_program(plan, output)
     if standing is not None:
         console.write_whole(standing, plan.deficit.as_built.write)
@@ -224,6 +235,15 @@ def _refuse_contradicting_words(scan_frame: str, pose: str | None, job: Path | N
         raise InputError(f"--scan-frame is {scan_frame!r}; it is one of {', '.join(FRAMES)}")
     if pose == OF_JOB and job is None:
         raise InputError("--part-pose job takes the place from the job; name it by --job JOB.gcode")
+
+
+def _refuse_plate_without_job(template: Path, pose: str | None) -> None:
+    """Refuse templates of which nobody says how they stand together."""
+    if template.is_dir() and pose != OF_JOB:
+        raise InputError(
+            f"{template} is a folder: where its parts stand together on the bed their job tells "
+            "(--job JOB.gcode --part-pose job); to repair one of them, name its own template"
+        )
 
 
 def _refuse_without_pose(job: Path | None, template: Path, setup: PrintSetup) -> NoReturn:
@@ -274,6 +294,7 @@ def _site_of(
 
     The guess is template from scan; None where alignment has to find the pose by itself.
     """
+    from amrepair.library import template_files
     from amrepair.loop.looks import plan_stops
     from amrepair.loop.sites import sites
     from amrepair.repair import Site
@@ -281,11 +302,15 @@ def _site_of(
 
     grid = grid_of(where.job, setup)
     with watch("template"):
-        field = open_template(template, progress=bars)
-    placed = where.placed
+        files = template_files(template) if template.is_dir() else [template]
+        fields = [open_template(path, progress=bars) for path in files]
+    field, placed = fields[0], where.placed
     if where.by_job and where.job is not None:
         with watch("locate"):
-            field, placed = where_the_job_prints_it(where.job, f"{where.path}", field, setup)
+            if template.is_dir():
+                field, placed = _plate_of(where.job, f"{where.path}", files, fields, setup)
+            else:
+                field, placed = where_the_job_prints_it(where.job, f"{where.path}", field, setup)
     guess = placed.inverse() if placed is not None and where.frame == "build" else None
     if where.by_job and where.job is not None and placed is not None:
         return field, sites(where.job, field, placed, setup)(plan_stops(where.job, ())[-1]), guess
@@ -370,10 +395,15 @@ def _told_of_supports(job: Path | None) -> Iterator[None]:
     except AlignmentError as error:
         if job is None:
             raise
-        raise AlignmentError(
-            f"{error}; {job} lays more than the part (skirt, brim, supports or a tower): if all of "
-            "it still stands where it was printed, say --part-pose job, and it is left aside"
-        ) from error
+        raise AlignmentError(f"{error}; {_lays_more(job)}") from error
+
+
+def _lays_more(job: Path) -> str:
+    """What may be beside the part, and how it is left aside."""
+    return (
+        f"{job} lays more than the part (skirt, brim, supports or a tower): if all of it still "
+        "stands where it was printed, say --part-pose job, and it is left aside"
+    )
 
 
 def _damage_at(text: str | None, scan_frame: str) -> tuple[float, float] | None:
@@ -481,6 +511,19 @@ def where_the_job_prints_it(
         said = "it lies in another way than its own file has it"
     console.errors.print(f"{name} prints the part: {said}.")
     return stood(template, copies)
+
+
+def _plate_of(
+    job: Job, name: str, files: Sequence[Path], fields: Sequence[Template], setup: PrintSetup
+) -> tuple[Template, Transform]:
+    """All that a job prints of several parts, as it stands on the bed; what it is is told."""
+    from amrepair.loop.locate import locate_plate, stood_plate
+
+    found = locate_plate(job, fields, layer_height_mm=setup.process.layer_height_mm)
+    names = [files[one.which].name for one in found]
+    each = ", ".join(f"{names.count(part)} of {part}" for part in dict.fromkeys(names))
+    console.errors.print(f"{name} prints {each}: all of it is taken to stand where it was printed.")
+    return stood_plate(fields, found)
 
 
 def _copies(job: Job, template: Template, setup: PrintSetup) -> tuple[Transform, ...]:

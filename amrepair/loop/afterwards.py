@@ -60,7 +60,13 @@ class Afterwards:
 
 
 def afterwards(
-    plan: RepairPlan, job: Job, template: Template, setup: PrintSetup, *, command: str
+    plan: RepairPlan,
+    job: Job,
+    template: Template,
+    setup: PrintSetup,
+    *,
+    command: str,
+    printed_at: Transform | None = None,
 ) -> Afterwards:
     """The ways to get at what a repair leaves open inside a part whose job is at hand.
 
@@ -70,9 +76,16 @@ def afterwards(
         The part, in the frame that the plan's scan was aligned to.
     command
         That makes the job that is left, without the layer.
+    printed_at
+        Build from template, where it is known already; a plate of parts is no single one of them.
     """
     *_, end = plan_stops(job, ())
-    placed, (copies, other) = plan.build_from_template, _copies(job, template, setup)
+    placed = plan.build_from_template
+    copies: tuple[Transform, ...]
+    if printed_at is not None:
+        copies, other = (printed_at,), ""
+    else:
+        copies, other = _copies(job, template, setup)
     aside = shifted(plan, job, template)
     # held against the job's beads: only where the part stands at their place
     stands = aside and not (other or _why_not_again(job, template, copies, placed, setup))

@@ -239,8 +239,8 @@ def _not_of(
     if len(templates) > 1:
         return AlignmentError(f"{things} fits none of the {len(templates)} templates ({error})")
     return AlignmentError(
-        f"{things} does not fit the template ({error}); 'amrepair loop' takes a folder of "
-        "templates, one of each part that a job prints"
+        f"{things} does not fit the template ({error}); name a folder of templates, one of each "
+        "part that the job prints, as --template"
     )
 
 

@@ -34,6 +34,7 @@ from amrepair.regions.options import RegionOptions
 from amrepair.regions.systematic import PoseKnown
 from amrepair.repair import scan_scope
 from amrepair.repair.filling import fillable, lines_of
+from amrepair.repair.other_part import refuse_other_part
 from amrepair.repair.path_offsets import off_by_job
 from amrepair.repair.plan import RepairPlan
 from amrepair.repair.site import Finished, Site
@@ -94,7 +95,8 @@ def plan_repair(
     ------
     AlignmentError
         If the scan cannot be aligned, equally good poses lead to different repairs, or a finished
-        part would stand in the bed, in the air or beyond the printer.
+        part would stand in the bed, in the air or beyond the printer, or what is scanned has its
+        walls elsewhere.
     DeficitError
         If the deficit is no valid solid.
     gcode.errors.GcodeError
@@ -118,6 +120,8 @@ def plan_repair(
     with watch("detect"):
         site = _by_the_bed(laid, site)
     anomaly, deficit = _judge(laid, site, watch, progress)
+    if site.printed_z_mm is None and not site.part_is_known:
+        refuse_other_part(anomaly, site.template, scan.source)
     chosen = registration_of_damage(scan, site, laid.registration, deficit)
     if chosen is not laid.registration:
         laid = laid.by(chosen)
@@ -157,8 +161,7 @@ class _Laid:
         Its range images, in the template's frame; None where a planned template ends in mid-air.
     pose
         How well the pose is known: `told` by the printer's own probe; `stands` for a part that
-        stands where it was printed, scanned in the printer's frame; `free` where the scan alone
-        tells it.
+        stands on the bed, scanned in the printer's frame; `free` where the scan alone tells it.
     """
 
     registration: Registration
@@ -236,8 +239,13 @@ def _align(
         whole,
         scan_scope.within_planned(scan_scope.without_beside(own, site), site),
         None if seen is None else tuple(image.moved(moved) for image in seen.result()),
-        "told" if known is not None else "stands" if scan.frame == "build" and said else "free",
+        "told" if known is not None else "stands" if _stands(scan, site, said) else "free",
     )
+
+
+def _stands(scan: Scan, site: Site, said: bool) -> bool:
+    """Whether the scan is in the printer's frame, and the part where the bed or a word puts it."""
+    return scan.frame == "build" and (said or not site.on_fixture)
 
 
 def _by_the_bed(laid: _Laid, site: Site) -> Site:

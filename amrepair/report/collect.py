@@ -40,6 +40,7 @@ from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup
 
 DIGITS = 6  # of every figure in a result: beyond what any scan can tell
+NEW_RATIO = 0.5  # of a piece, where nothing was missing before: more is not the same one again
 _LIBRARIES = (
     "amrepair",
     "manifold3d",
@@ -100,14 +101,21 @@ def region_rows(plan: RepairPlan) -> tuple[RegionRow, ...]:
     return tuple(rows)
 
 
-def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None) -> dict[str, Any]:
+def plan_figures(
+    first: Sequence[RepairPlan],
+    last: Sequence[RepairPlan] | None,
+    later: Sequence[RepairPlan] = (),
+) -> dict[str, Any]:
     """Volumes over the first and last look of every stop; `last` None where not rescanned.
 
-    What stands out at one stop is seen again at the next, and counts once.
+    What stands out at one stop is seen again at the next, and counts once. Of the `later` looks,
+    after a stop's first, counts what no look before them found.
     """
     ends = first if last is None else last
     return {
-        "missing_mm3_before": together_mm3(p.deficit.missing for p in first),
+        "missing_mm3_before": found_mm3(
+            [p.deficit.missing for p in first], [p.deficit.missing for p in later]
+        ),
         "missing_mm3_after": None
         if last is None
         else together_mm3(p.deficit.missing for p in last),
@@ -127,6 +135,21 @@ def plan_figures(first: Sequence[RepairPlan], last: Sequence[RepairPlan] | None)
             for row in region_rows(plan)
         ],
     }
+
+
+def found_mm3(first: Sequence[manifold3d.Manifold], later: Sequence[manifold3d.Manifold]) -> float:
+    """Volume of what any look found missing.
+
+    A later look sees what is left otherwise by its noise, which is nothing new: of it those pieces
+    count that lie for the larger part where nothing was missing before.
+    """
+    known = [solid for solid in first if not solid.is_empty()]
+    for solid in later:
+        for piece in solid.decompose():
+            new = manifold3d.Manifold.batch_boolean([piece, *known], manifold3d.OpType.Subtract)
+            if new.volume() > NEW_RATIO * piece.volume():
+                known.append(piece)
+    return together_mm3(known)
 
 
 def covered_mm3(report: LoopReport) -> float:
@@ -170,7 +193,9 @@ def loop_result(
     printed = [look.plan for look in report.looks if look.printed]
     result = {
         **plan_figures(
-            [look.plan for look in report.first_looks], [look.plan for look in report.last_looks]
+            [look.plan for look in report.first_looks],
+            [look.plan for look in report.last_looks],
+            [look.plan for looks in report.by_stop.values() for look in looks[1:]],
         ),
         "covered_mm3": covered_mm3(report),
         "repaired_ratio": repaired_ratio,

@@ -55,13 +55,39 @@ def test_what_the_job_laid_beside_is_none_of_the_part(broken: Path, tmp_path: Pa
     # part "did not fit its template", whatever was said
     words = ["repair", broken / "scan.xyz", "--template", broken / "part.stl"]
     words += ["-o", tmp_path / "repair.gcode", "--job", broken / "job.gcode", "--json"]
-    refused = here(*words)
-    assert refused.returncode == 2
-    assert "say --part-pose job" in refused.stderr
+    unsaid = here(*words)  # found beside them, of which some are too much
+    assert json.loads(unsaid.stdout)["excess_mm3_before"] > 100.0
+    assert "say --part-pose job" in unsaid.stderr
     done = here(*words, "--part-pose", "job")
     result = json.loads(done.stdout)
     assert result["missing_mm3_before"] == pytest.approx((BLOCK ^ CORNER).volume(), rel=0.1)
     assert result["excess_mm3_before"] < 0.5
+    assert result["filament_mm"] > 0.0
+
+
+def test_a_plate_of_different_parts_is_one_scan(tmp_path: Path) -> None:
+    # regression: a folder of templates, as 'amrepair loop' takes it, was "neither a .safetensors
+    # file nor a mesh", and one template "did not fit" the job's second thing
+    text = write(plan_part(BLOCK + WALL, SETUP).toolpath, SETUP, title="job").text
+    (tmp_path / "job.gcode").write_text(text)
+    (tmp_path / "parts").mkdir()
+    for name, part in (("block", BLOCK), ("wall", WALL)):
+        analytic.to_trimesh(part).export(tmp_path / "parts" / f"{name}.stl")
+    sensors = np.array([[0.0, 0.0, 300.0], [200.0, 200.0, 300.0], [100.0, 97.0, 300.0]])
+    points, _ = analytic.ray_scan(
+        BLOCK - CORNER + WALL, sensors, spacing_mm=0.25, sigma_mm=0.03, seed=1
+    )
+    np.savetxt(tmp_path / "scan.xyz", points, fmt="%.4f")
+    words = ["repair", tmp_path / "scan.xyz", "-o", tmp_path / "repair.gcode", "--json"]
+    job = ["--job", tmp_path / "job.gcode", "--part-pose", "job"]
+    one = here(*words, "--template", tmp_path / "parts" / "block.stl", *job)
+    assert "name a folder of templates" in one.stderr
+    unsaid = here(*words, "--template", tmp_path / "parts")
+    assert "--part-pose job" in unsaid.stderr
+    done = here(*words, "--template", tmp_path / "parts", *job)
+    assert "prints 1 of wall.stl, 1 of block.stl" in done.stderr
+    result = json.loads(done.stdout)
+    assert result["missing_mm3_before"] == pytest.approx((BLOCK ^ CORNER).volume(), rel=0.1)
     assert result["filament_mm"] > 0.0
 
 
