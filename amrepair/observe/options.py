@@ -1,4 +1,4 @@
-"""Options of the background, that is of the points of a scan that are not the part."""
+"""Options of what is read off a scan: its background, and its views by the order of points."""
 
 from __future__ import annotations
 
@@ -45,4 +45,48 @@ class BackgroundOptions:
 
 
 DEFAULT_BACKGROUND = BackgroundOptions()
+"""The default of the test for regions."""
+
+
+@dataclass(frozen=True, slots=True)
+class OrderOptions:
+    """Views told apart by the order of a cloud's points.
+
+    Attributes
+    ----------
+    most_points
+        Of more points every second, third … tells enough.
+    across
+        A place is a cell of this part of the cloud's diagonal: a few of a scanner's rows, of which
+        a view has 200 and more.
+    most_parts
+        A view begins at the boundary that parts the fewest pairs, in one of so many parts of the
+        order.
+    least_told
+        A boundary must part this share of all pairs that are of two views.
+    least_again
+        Places must have been seen again so often, in the mean, or views hardly overlap.
+    least_wide
+        A view is so many cells wide, in the median of its views: a surface, not a line. Rows of a
+        single view that were taken for views are 1 to 2 wide, real views 13 and more.
+    most_beside
+        Views lie in a cell one over the other, not side by side: by the variance between them over
+        that within them (Fisher's F). Real views have 0.6 to 1.3, blocks of a fused cloud 3.8 and
+        more.
+    most_contradicted
+        At most this share of the pairs that are of two views is contradicted. Ten real
+        views, one after the other, leave 0.01; mixed points 0.14 and more.
+    """
+
+    most_points: int = 65_536
+    across: int = 64
+    most_parts: int = 512
+    least_told: float = 0.002
+    least_again: float = 0.2
+    least_wide: float = 4.0
+    most_beside: float = 2.0
+    most_contradicted: float = 0.05
+
+
+DEFAULT_ORDER = OrderOptions()
 """The default of the test for regions."""

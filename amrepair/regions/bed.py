@@ -18,6 +18,7 @@ from amrepair.frames import cells_of, in_box
 from amrepair.observe.incidence import incidence
 from amrepair.observe.nuisance import fit_nuisance
 from amrepair.observe.options import BackgroundOptions
+from amrepair.observe.order import views_of
 from amrepair.regions.error_calibration import BED_BESIDE, NORMAL_BY_BED, Calibration
 from amrepair.regions.error_calibration_fit import (
     NONE_FAR_OFF,
@@ -118,7 +119,8 @@ def _levels(
         correlation_mm=options.correlation_mm,
     )
     removed_mm = found.removed_mm(surfels.place_mm, normal, None)
-    shares = None if bed.view_index is None else surfels.by_view(bed.view_index)
+    view = views_of(bed, options.order)
+    shares = None if view is None else surfels.by_view(view)
     inspected = Inspected(
         cells=n,
         cell_mm=surfels.cell_mm,

@@ -19,6 +19,7 @@ from amrepair.field.fused import Surfels, make_surfels
 from amrepair.field.near import has_near, nearest_within
 from amrepair.frames import unit_vectors
 from amrepair.observe.background import background
+from amrepair.observe.order import views_of
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
 from amrepair.observe.views import Shares
 from amrepair.regions.options import RegionOptions
@@ -107,14 +108,16 @@ def observed(
     refuse_wrong_scale(scan, template)
     with ThreadPoolExecutor(1) as beside:  # range images and distances do not need each other
         asked = None if images is not None else beside.submit(range_images, scan)
+        told = beside.submit(views_of, scan, options.order)
         f_mm = template.distance(scan.points_mm)
         surface_mm, normals = surface or template.surface_points(options.spacing_mm)
         keep = ~background(scan, template, f_mm, surface_mm, options.background)
         if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
             keep &= scan.edge & FLYING == 0
+        view = told.result()
         if without:
-            assert scan.view_index is not None
-            keep &= ~np.isin(scan.view_index, without)
+            assert view is not None
+            keep &= ~np.isin(view, without)
         if not keep.any():
             raise InputError(
                 f"no point of the scan {scan.source} lies within "
@@ -139,7 +142,7 @@ def observed(
     on = ShownSurface(surface_mm, normals, nearest >= 0, present_mm)
     # where rays are known they tell what of a wall is gone
     ends = NO_ENDS if seen else wall_ends(scan, template, surfels, on, planes, options.wall_ends)
-    shares = None if scan.view_index is None else surfels.by_view(scan.view_index)
+    shares = None if view is None else surfels.by_view(view)
     return Observed(
         scan, template, f_mm, keep, surfels, outward, seen, surface_mm, normals, apart_mm**2,
         nearest, crossed, ends, shares,

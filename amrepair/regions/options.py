@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from amrepair.errors import InputError
 from amrepair.field.options import EvidenceOptions, SurfelOptions
-from amrepair.observe.options import BackgroundOptions
+from amrepair.observe.options import BackgroundOptions, OrderOptions
 from amrepair.template.laid import SUNK_LAYERS
 
 
@@ -189,9 +189,9 @@ class RegionOptions:
     sheet_beads
         Two sheets of points at one place are an error if they lie closer than so many beads, as no
         thinner wall stands between them: slicers make one of two beads at least.
-    wall_ends, background, surfels, evidence
-        Options for the ends of thin walls, for what is not the part, for condensing the scan, and
-        for the space around broken surface.
+    wall_ends, background, order, surfels, evidence
+        Options for the ends of thin walls, for what is not the part, for views told apart by the
+        order of points, for condensing the scan, and for the space around broken surface.
     top_k
         How many of the highest scores make the object score (PASDF: 1000).
     """
@@ -220,6 +220,7 @@ class RegionOptions:
     sheet_beads: float = 2.0
     wall_ends: WallEndOptions = field(default_factory=WallEndOptions)
     background: BackgroundOptions = field(default_factory=BackgroundOptions)
+    order: OrderOptions = field(default_factory=OrderOptions)
     surfels: SurfelOptions = field(default_factory=SurfelOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     top_k: int = 1000
