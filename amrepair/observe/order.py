@@ -44,23 +44,24 @@ def views_in_order(points_mm: Points, options: OrderOptions = DEFAULT_ORDER) -> 
     step = -(-len(points_mm) // options.most_points)
     some = points_mm[::step]
     first, last, places = _pairs(some, options)
-    least: tuple[float, Numbers | None] = options.most_contradicted, None
+    found: list[tuple[float, Numbers]] = []
     for apart in _distances(len(some)):
         far = int(np.count_nonzero(last - first > apart))
         if far < options.least_again * places:
             break
         begins, contradicted = _runs(first, last, apart, len(some), options)
-        if contradicted <= least[0] * far:
-            least = contradicted / far, begins
-    if least[1] is None or len(least[1]) < 2:
-        return None
-    view = np.searchsorted(least[1], np.arange(len(some)), side="right") - 1
+        if len(begins) > 1 and contradicted <= options.most_contradicted * far:
+            found.append((contradicted / far, begins))
     cells = _cells(some, 0.0, options)
-    if _wide(cells, view) < options.least_wide:  # rows of a single view
-        return None
-    if _side_by_side(some, cells, view) > options.most_beside:  # blocks of one cloud
-        return None
-    return np.asarray(np.repeat(view, step)[: len(points_mm)], np.int64)
+    for _, begins in sorted(found, key=lambda one: one[0]):
+        view = np.searchsorted(begins, np.arange(len(some)), side="right") - 1
+        # neither rows of a single view nor blocks of one cloud
+        if (
+            _wide(cells, view) >= options.least_wide
+            and _side_by_side(some, cells, view) <= options.most_beside
+        ):
+            return np.asarray(np.repeat(view, step)[: len(points_mm)], np.int64)
+    return None
 
 
 def _cells(points_mm: Points, aside: float, options: OrderOptions) -> Int[np.ndarray, "n 3"]:
@@ -78,7 +79,7 @@ def _wide(cells: Int[np.ndarray, "n 3"], view: Numbers) -> float:
     """How many cells wide the median view is: its cells over its length in cells."""
     place = _key(cells)
     filled = np.bincount(np.unique(place + view * (place.max() + 1)) // (place.max() + 1))
-    runs = np.split(cells, np.flatnonzero(np.diff(view)) + 1)
+    runs = np.split(cells.astype(float), np.flatnonzero(np.diff(view)) + 1)
     return float(np.median(filled / [max(diagonal(run), 1.0) for run in runs]))
 
 
@@ -106,7 +107,9 @@ def _side_by_side(points_mm: Points, cells: Int[np.ndarray, "n 3"], view: Number
     return between_mm2 / max(within_mm2, np.finfo(float).tiny)
 
 
-def _pairs(points_mm: Points, options: OrderOptions) -> tuple[Numbers, Numbers, int]:
+def _pairs(
+    points_mm: Points, options: OrderOptions
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], int]:
     """(k,) points of one place that follow each other in the order, twice; how many places.
 
     Places are cells of two grids, half a cell apart: else the rows of a scanner that lie along a

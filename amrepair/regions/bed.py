@@ -129,7 +129,7 @@ def _levels(
         value_mm=surfels.deviation_mm - removed_mm,
         weight=surfels.count.astype(np.float64),
         tolerance_mm=np.full((2, n), tolerance_mm),
-        facing=incidence(normal, surfels.toward_sensors(np.arange(n))),
+        facing=incidence(normal, surfels.toward_sensors(np.arange(n)), shares),
         pose_mm=np.zeros(n),
         shares=shares and replace(shares, value_mm=shares.value_mm - removed_mm[shares.place]),
     )

@@ -105,7 +105,7 @@ def inspected_of(
     deep_mm = _at_most_through(template, crossed_mm, seen.normals[crossed.which], crossed.depth_mm)
     value_mm = np.concatenate([surfels.deviation_mm, -deep_mm, -ends.depth_mm])
     # what rays passed has no points of its own: it was seen as most places were, as were ends
-    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels))))
+    facing = incidence(outward, surfels.toward_sensors(np.arange(len(surfels))), seen.shares)
     usual_count, usual_facing = (float(np.median(told)) for told in (surfels.count, facing))
     others = len(crossed_mm) + len(ends)
     anywhere_mm, top_mm = tolerances(options, template)
