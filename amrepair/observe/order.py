@@ -28,9 +28,18 @@ def views_of(scan: Scan, options: OrderOptions = DEFAULT_ORDER) -> Numbers | Non
 
     None where nobody knows, or all are of one.
     """
-    if scan.grids is not None or scan.sensor_index is not None:
+    if _says(scan):
         return scan.view_index
     return views_in_order(scan.points_mm, options)
+
+
+def views_from(scan: Scan) -> str:
+    """What `views_of` tells views apart by, in words."""
+    return "its sensors" if _says(scan) else "the order of its points"
+
+
+def _says(scan: Scan) -> bool:
+    return scan.grids is not None or scan.sensor_index is not None
 
 
 def views_in_order(points_mm: Points, options: OrderOptions = DEFAULT_ORDER) -> Numbers | None:

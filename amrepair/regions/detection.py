@@ -164,7 +164,7 @@ def _tested(
     return Tested(
         levels,
         calibration,
-        noise=noise_of(levels, seen.shares, seen.scan.sigma_mm, options),
+        noise=noise_of(levels, seen.shares, seen.scan, options),
         missing=labels[0, :cells],
         excess=labels[1, :cells],
         gone=gone,

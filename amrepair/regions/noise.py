@@ -8,9 +8,11 @@ import numpy as np
 
 from amrepair.field.scales import Scale
 from amrepair.field.scales_kernels import NORMAL_MEDIAN
+from amrepair.observe.order import views_from
 from amrepair.observe.views import Shares
 from amrepair.regions.options import RegionOptions
 from amrepair.regions.significance import OUTLIER_SIGMAS, Level, point_sigma_mm
+from amrepair.scans import Scan
 
 # Errors hang together over the distance at which their variogram has reached this share (1 − 1/e).
 SILL_SHARE = 0.632
@@ -34,6 +36,8 @@ class Noise:
         Over which distance errors hang together; 0 where no farther than a cell.
     view_disagreement_mm
         Standard deviation between what views say of the same place; None with one view.
+    views_from
+        What tells views apart: the scan's sensors, or the order of its points; None with one view.
     smallest_mm
         Of each scale: area of a window, mm², and the least depth that it would show, mm.
     source
@@ -50,6 +54,7 @@ class Noise:
     smallest_mm: tuple[tuple[float, float], ...]
     source: str
     judged_share: float = 1.0
+    views_from: str | None = None
 
     @property
     def too_sparse(self) -> bool:
@@ -74,7 +79,10 @@ class Noise:
         if self.correlation_mm:
             words.append(f"errors hang together over {self.correlation_mm:.1f} mm")
         if self.view_disagreement_mm is not None:
-            words.append(f"views differ by {self.view_disagreement_mm:.3f} mm")
+            words.append(
+                f"views, told apart by {self.views_from}, differ by "
+                f"{self.view_disagreement_mm:.3f} mm"
+            )
         return "; ".join(words) + "."
 
     def to_json(self) -> dict[str, object]:
@@ -85,7 +93,7 @@ class Noise:
 
 
 def noise_of(
-    levels: tuple[Level, ...], shares: Shares | None, profile_mm: float, options: RegionOptions
+    levels: tuple[Level, ...], shares: Shares | None, scan: Scan, options: RegionOptions
 ) -> Noise:
     """Tell the noise of a scan from its tested scales.
 
@@ -93,12 +101,14 @@ def noise_of(
     ----------
     levels
         The first scale's third deviations and medians, then every wider scale's medians.
-    profile_mm
-        The scanner's own word on its noise, where the scan has too few cells to tell.
+    shares
+        What each view says of each cell; None where views are not told apart.
+    scan
+        Its sigma is the scanner's own word on its noise, where the scan has too few cells to tell.
     """
     first = levels[0].scale
     told = len(first) >= options.least_cells
-    sigma_mm = point_sigma_mm(first) if told else profile_mm
+    sigma_mm = point_sigma_mm(first) if told else scan.sigma_mm
     off = np.abs(first.value_mm - first.median_mm) > OUTLIER_SIGMAS * np.maximum(
         first.noise_mm, 1e-9
     )
@@ -112,6 +122,7 @@ def noise_of(
         ),
         source="this scan" if told else f"the profile's, {len(first)} cells are too few to tell",
         judged_share=_judged_share(levels),
+        views_from=None if shares is None else views_from(scan),
     )
 
 
