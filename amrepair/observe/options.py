@@ -56,9 +56,10 @@ class OrderOptions:
     ----------
     most_points
         Of more points every second, third … tells enough.
-    across
+    most_across, points_across
         A place is a cell of this part of the cloud's diagonal: a few of a scanner's rows, of which
-        a view has 200 and more.
+        a view has 200 and more; wider where a square of so many cells would have fewer points in
+        each than this.
     most_parts
         A view begins at the boundary that parts the fewest pairs, in one of so many parts of the
         order.
@@ -66,6 +67,8 @@ class OrderOptions:
         A boundary must part this share of all pairs that are of two views.
     least_again
         Places must have been seen again so often, in the mean, or views hardly overlap.
+    most_apart
+        A view leaves several points at a place, so that at most this share of the pairs is of two.
     least_wide
         A view is so many cells wide, in the median of its views: a surface, not a line. Rows of a
         single view that were taken for views are 1 to 2 wide, real views 13 and more.
@@ -79,10 +82,12 @@ class OrderOptions:
     """
 
     most_points: int = 65_536
-    across: int = 64
+    most_across: float = 64.0
+    points_across: float = 16.0
     most_parts: int = 512
     least_told: float = 0.002
     least_again: float = 0.2
+    most_apart: float = 0.5
     least_wide: float = 4.0
     most_beside: float = 2.0
     most_contradicted: float = 0.05

@@ -58,6 +58,8 @@ def views_in_order(points_mm: Points, options: OrderOptions = DEFAULT_ORDER) -> 
         far = int(np.count_nonzero(last - first > apart))
         if far < options.least_again * places:
             break
+        if far > options.most_apart * len(first):
+            continue
         begins, contradicted = _runs(first, last, apart, len(some), options)
         if len(begins) > 1 and contradicted <= options.most_contradicted * far:
             found.append((contradicted / far, begins))
@@ -76,7 +78,8 @@ def views_in_order(points_mm: Points, options: OrderOptions = DEFAULT_ORDER) -> 
 def _cells(points_mm: Points, aside: float, options: OrderOptions) -> Int[np.ndarray, "n 3"]:
     """(n, 3) the place of each point, in a grid that begins so many cells before them."""
     low_mm = points_mm.min(axis=0)
-    cell_mm = max(diagonal(points_mm) / options.across, np.finfo(float).tiny)
+    across = min(options.most_across, np.sqrt(len(points_mm) / options.points_across))
+    cell_mm = max(diagonal(points_mm) / across, np.finfo(float).tiny)
     return cells_of(points_mm, low_mm - aside * cell_mm, cell_mm)
 
 
