@@ -55,8 +55,11 @@ def together(first, last, apart, begins, points):
     """
     m = len(begins)
     of = np.zeros(points, np.int64)
-    for k in range(1, m):
-        of[begins[k] :] = k
+    run = 0
+    for i in range(points):
+        while run + 1 < m and begins[run + 1] <= i:
+            run += 1
+        of[i] = run
     within = np.zeros((m + 1, m + 1), np.int64)
     for k in range(len(first)):
         if last[k] - first[k] > apart:
