@@ -12,9 +12,10 @@ from typing import Literal
 
 import numpy as np
 
-from amrepair.arrays import Values
+from amrepair.arrays import Points, Values
 from amrepair.field.groups import cell_numbers
-from amrepair.frames import cells_of
+from amrepair.field.scales import ways_of
+from amrepair.frames import cells_of, unit_vectors
 from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
 from amrepair.observe.views import Contradiction, Shares, contradictions
@@ -98,12 +99,13 @@ def _without_nuisance(
     told = seen.shares or Shares(every, 0 * every, inspected.value_mm[:n], seen.surfels.count)
     view = told.view if views_known else None
     place_mm, normal = inspected.place_mm[told.place], inspected.normal[told.place]
+    whole_place_mm, whole_normal, whole = _halves_joined(inspected, told)
     found = fit_nuisance(
-        place_mm,
-        normal,
-        told.value_mm,
-        told.count.astype(np.float64),
-        view=view,
+        whole_place_mm,
+        whole_normal,
+        whole.value_mm,
+        whole.count.astype(np.float64),
+        view=whole.view if views_known else None,
         tolerance_mm=float(np.median(inspected.tolerance_mm)),
         correlation_mm=options.correlation_mm,
         pose_known=pose == "stands",
@@ -119,6 +121,26 @@ def _without_nuisance(
     # what views disagree by is in `pose_mm`, and is not counted by width as well
     inspected = replace(inspected, value_mm=whole_mm, pose_mm=pose_mm, shares=None)
     return found, inspected, left if views_known else None
+
+
+def _halves_joined(inspected: Inspected, told: Shares) -> tuple[Points, Points, Shares]:
+    """(j, 3) places, (j, 3) normals, and what was told of them, one over the other as one.
+
+    Where noise is as thick as a cell, boundaries between cells cut it in two along the surface.
+    Neither half lies about the surface: the median of such halves is that of the larger ones.
+    """
+    cells = slice(inspected.cells)
+    feet_mm, normal = inspected.place_mm[cells], inspected.normal[cells]
+    key = np.column_stack([cells_of(feet_mm, 0.0, inspected.cell_mm), ways_of(normal)])
+    joined = cell_numbers(key)
+    whole = replace(told, place=joined[told.place]).gathered()
+    points = np.bincount(joined, inspected.weight[cells])
+
+    def mean(each: Points) -> Points:
+        sums = [np.bincount(joined, inspected.weight[cells] * one) for one in each.T]
+        return np.stack(sums, axis=1)[whole.place] / points[whole.place, None]
+
+    return mean(feet_mm), unit_vectors(mean(normal)), whole
 
 
 def _between_views_mm(shares: Shares, places: int, point_sigma_mm: float) -> Values:

@@ -19,7 +19,7 @@ from gcode.slicing.infill import ring_beads, solid_fill
 from gcode.slicing.job_lines import JobPieces, gathered
 from gcode.slicing.medial import fill_thin
 from gcode.slicing.options import FillOptions, PatchOptions
-from gcode.slicing.patch_middles import FreeBetween, in_the_middle, left_of
+from gcode.slicing.patch_middles import FreeBetween, in_the_middle, left_of, turn_rad
 from gcode.slicing.patch_model import PatchModel
 from gcode.slicing.reach import Reach
 from gcode.slicing.regions import SIMPLIFY_MM, offset, peel, pieces
@@ -152,11 +152,18 @@ class _Shares:
         return np.bincount(self.piece, of_column, minlength=self.tree.n).astype(np.float64)
 
     def off_mm(self, runs: list[Bead], model: PatchModel) -> Float[np.ndarray, " m"]:
-        """How far to the left of each piece the middle of its columns lies."""
+        """How far to the left of each piece the middle of its columns lies.
+
+        That is halfway across them. Where a line bends, more columns lie outside than inside it,
+        and each counts by as much less as the line beside there is longer than the piece.
+        """
         left = np.concatenate([left_of(run.xy_mm) for run in runs])
+        turn = np.concatenate([turn_rad(run) for run in runs])
         away_mm = model.points_mm[self.columns] - self.middle_mm[self.piece]
-        number = np.bincount(self.piece, minlength=self.tree.n)
-        return self.sums((away_mm * left[self.piece]).sum(axis=1)) / np.maximum(number, 1)
+        away_mm = (away_mm * left[self.piece]).sum(axis=1)
+        beside_mm = self.length_mm[self.piece] - turn[self.piece] * away_mm
+        each = 1.0 / np.maximum(beside_mm, 0.5 * model.cell_mm)
+        return self.sums(each * away_mm) / np.maximum(self.sums(each), 1e-9)
 
     @property
     def deep_mm(self) -> Float[np.ndarray, " m"]:

@@ -59,3 +59,15 @@ def left_of(xy_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     along = np.diff(xy_mm, axis=0)
     length_mm = np.maximum(np.hypot(*along.T), 1e-9)
     return np.stack([-along[:, 1], along[:, 0]], axis=1) / length_mm[:, None]
+
+
+def turn_rad(run: Bead) -> Float[np.ndarray, " m"]:
+    """How far to its left a line turns over each piece: by half of what it turns at both ends."""
+    way = np.diff(run.xy_mm, axis=0)
+    if run.closed:
+        way = np.concatenate([way[-1:], way, way[:1]])
+    (ax, ay), (bx, by) = way[:-1].T, way[1:].T
+    at_points = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
+    if not run.closed:
+        at_points = np.concatenate([[0.0], at_points, [0.0]])
+    return np.asarray(0.5 * (at_points[:-1] + at_points[1:]))

@@ -15,7 +15,7 @@ from gcode.slicing.patch import slice_patch
 from gcode.slicing.patch_middles import in_the_middle
 from gcode.surfaces import HeightField
 from gcode.writer import write
-from tests.judge import judge
+from tests.judge import Verdict, judge
 
 LINE = Bead(np.array([[0.0, 0.0], [0.4, 0.0], [0.8, 0.0]]), np.ones(2), Role.SOLID_INFILL, False)
 Solid = manifold3d.Manifold
@@ -52,19 +52,30 @@ def _mesh(solid: Solid) -> trimesh.Trimesh:
     )
 
 
-def test_a_ring_is_filled_to_its_rims_and_not_over_them() -> None:
-    """Lines lay nearer to a rim than to each other: 0.950 filled, 6.4 % over the rims."""
-    ring = Solid.cylinder(6.0, 5.0, 5.0, 96)
-    ring -= Solid.cylinder(9.0, 3.4, 3.4, 96).translate((0.0, 0.0, -1.0))
-    ring = ring.translate((103.03, 104.02, 0.0))
-    tool = Solid.cube((20.0, 20.0, 9.0)).translate((93.0, 94.0, 4.8))
-    piece, rest = ring ^ tool, ring - tool
+def _judged(part: Solid, above_mm: float) -> Verdict:
+    """What the outside judge says of a patch for all of a part over a height."""
+    part = part.translate((103.03, 104.02, 0.0))
+    tool = Solid.cube((20.0, 20.0, 9.0)).translate((93.0, 94.0, above_mm))
+    piece, rest = part ^ tool, part - tool
     setup = load_setup()
     as_built = HeightField.from_manifold(rest, 0.1, margin_mm=8.0)
     grid = LayerGrid.from_setup(setup)
     plan = slice_patch(piece, setup, as_built=as_built, grid=grid, standalone=True)
-    text = write(plan.toolpath, setup, title="ring", resume=None, restore=False).text
+    text = write(plan.toolpath, setup, title="middles", resume=None, restore=False).text
     box = np.asarray(piece.bounding_box()).reshape(2, 3)
-    verdict = judge(text, _mesh(rest), _mesh(ring), box)
+    return judge(text, _mesh(rest), _mesh(part), box)
+
+
+def test_a_ring_is_filled_to_its_rims_and_not_over_them() -> None:
+    """Lines lay nearer to a rim than to each other: 0.950 filled, 6.4 % over the rims."""
+    ring = Solid.cylinder(6.0, 5.0, 5.0, 96)
+    ring -= Solid.cylinder(9.0, 3.4, 3.4, 96).translate((0.0, 0.0, -1.0))
+    verdict = _judged(ring, 4.8)
     assert verdict.filled_ratio >= 0.98
     assert verdict.outside_ratio <= 0.035
+
+
+def test_a_pin_is_filled_as_far_inside_its_only_line_as_outside() -> None:
+    """Most of a disc's columns lie outside a line in it, which moved out to them: 0.905 filled."""
+    pin = Solid.cylinder(6.0, 0.7, 0.7, 32) + Solid.cube((8.0, 8.0, 2.0)).translate((-4, -4, 0))
+    assert _judged(pin, 3.5).filled_ratio >= 0.93
