@@ -34,7 +34,13 @@ from gcode.cli.options import (
     program_text,
     refuse_standing,
 )
-from gcode.cli.owning import ChosenSetup, JobMaterialOption, JobPrinterOption, chosen_setup
+from gcode.cli.owning import (
+    NOBODY_NAMED,
+    ChosenSetup,
+    JobMaterialOption,
+    JobPrinterOption,
+    chosen_setup,
+)
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS
 
@@ -225,7 +231,7 @@ def _title(scan: Path, chosen: ChosenSetup) -> str:
     lines = [f"repair of {scan.name}"]
     lines += [profiles_line(chosen.ids)] if chosen.ids is not None else []
     if chosen.printer_from == "default":
-        lines.append("the printer is the default: none was named")
+        lines.append(NOBODY_NAMED)
     return "\n".join(lines)
 
 
