@@ -7,8 +7,10 @@ import io
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import manifold3d as m3
@@ -215,6 +217,49 @@ def test_every_end_has_its_code_and_one_sentence(
     told = capsys.readouterr().err.strip()
     assert said in told
     assert len(told.splitlines()) == bool(said)
+
+
+def test_an_interrupt_that_a_library_swallows_is_told_as_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """regression: Ctrl+C while trimesh was loading ended in a traceback and exit code 1."""
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.command()
+    def go(pressed: bool = False) -> None:
+        with suppress(KeyboardInterrupt):
+            if pressed:
+                signal.raise_signal(signal.SIGINT)
+        raise TypeError("unsupported operand: 'ExceptionWrapper'")
+
+    monkeypatch.setattr("sys.argv", ["amrepair", "--pressed"])
+    with pytest.raises(SystemExit) as end:
+        console.run(app, "amrepair", (AmrepairError,))
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "amrepair: interrupted\n"
+    monkeypatch.setattr("sys.argv", ["amrepair"])
+    with pytest.raises(TypeError):  # a fault of ours is no interrupt
+        console.run(app, "amrepair", (AmrepairError,))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupt_while_libraries_load_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """regression: `gcode` ended in a traceback."""
+
+    class Pressed:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "gcode.cli.app":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "gcode.cli.app")
+    monkeypatch.delattr(gcode.cli, "app", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Pressed(), *sys.meta_path])
+    with pytest.raises(SystemExit) as end:
+        gcode.cli.main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "gcode: interrupted\n"
 
 
 def test_with_json_a_failure_is_one_object_too(
