@@ -63,7 +63,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 _circles_left: list[bool] = []
-_interrupts: list[int] = []  # Ctrl+C of the command under way
+_interrupts: list[int] = []  # of the command under way: Ctrl+C, and what ends it likewise
 
 
 class _TimeLeft(TimeRemainingColumn):
@@ -268,6 +268,7 @@ def signals_end_it() -> Iterator[None]:
     """
 
     def interrupt(number: int, frame: object) -> None:
+        _interrupts.append(number)
         raise KeyboardInterrupt
 
     ends = {signal.SIGTERM}
@@ -284,8 +285,22 @@ def signals_end_it() -> Iterator[None]:
 
 
 @contextmanager
+def interrupts_as_such() -> Iterator[None]:
+    """Within it an interrupt is one wherever it comes: compiled code makes an error of it."""
+    try:
+        yield
+    except SystemError as error:
+        cause = error.__cause__
+        while isinstance(cause, SystemError):
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from None
+        raise
+
+
+@contextmanager
 def _interrupts_noted() -> Iterator[None]:
-    """Note every Ctrl+C, which Python tells as ever."""
+    """Note every interrupt, which is told as ever: what it comes to is not always told as one."""
 
     def note(number: int, frame: FrameType | None) -> None:
         _interrupts.append(number)
@@ -360,7 +375,7 @@ def _ended(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> i
     except OSError as error:
         return _failed(f"{name}: {in_words(error)}", InputError.exit_code)
     except Exception:
-        # an interrupt while a library loads is swallowed by some (trimesh), which then fail
+        # of an interrupt in compiled code, or while a library loads that swallows it (trimesh)
         if not _interrupts:
             raise
         code = INTERRUPTED
