@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import typer
 from rich.console import Console
+from typer.testing import CliRunner
 
 import gcode
 from amrepair.align.standing import refuse_impossible
@@ -35,7 +36,8 @@ from gcode.cli.words import what_it_does
 from gcode.errors import InputError as GcodeInputError
 from gcode.errors import LinkError
 from gcode.estimate import estimate
-from gcode.hosts.port import Temperatures
+from gcode.hosts.port import PrintReport, Temperatures
+from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
 from gcode.slicing.job import plan_part
 from gcode.writer import write
@@ -260,6 +262,33 @@ def test_an_interrupt_while_libraries_load_is_one_sentence(
         gcode.cli.main()
     assert end.value.code == 130
     assert capsys.readouterr().err == "gcode: interrupted\n"
+
+
+def test_an_interrupted_print_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: it said "interrupted" alone."""
+    done: list[str] = []
+
+    class Interrupted(SerialPrinter):
+        def __init__(self, *_: object, **__: object) -> None: ...
+        def connect(self) -> None: ...
+        def abort(self) -> None:
+            done.append("abort")
+
+        def close(self) -> None:
+            done.append("close")
+
+        def print(self, *_: object, **__: object) -> PrintReport:
+            raise KeyboardInterrupt
+
+    job = tmp_path / "job.gcode"
+    job.write_text("G28\nM104 S0\n")
+    monkeypatch.setattr("gcode.hosts.connect", Interrupted)
+    run = CliRunner().invoke(gcode_app, ["send", str(job), "--port", "/dev/ttyACM0"])
+    assert run.exit_code == 130
+    assert done == ["abort", "close"]
+    assert "the same command goes on with --resume" in " ".join(run.stderr.split())
 
 
 def test_with_json_a_failure_is_one_object_too(
