@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from amrepair.cli import error_calibration
 from tests.commands import ROOT, here
 
 KNOB = ROOT / "examples" / "parts" / "knob.stl"
@@ -239,6 +240,23 @@ def test_align_and_detect_write_what_the_contract_says(
     assert {"object_score", "threshold", "regions", "symmetric_alternatives", "inlier_ratio",
             "clutter_ratio"} <= set(told)  # fmt: skip
     assert told["regions"][0]["volume_mm3"] == pytest.approx(8 * 8 * 1.2, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_calibration_by_a_part_that_is_not_sound_is_doubted(
+    chipped: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: a scan with dents was learned from in silence, and hid such dents ever after."""
+    monkeypatch.setattr(error_calibration, "users_folder", lambda: tmp_path)
+    words = ["--sound", chipped["scan.xyz"], "--name", "bench", "--json"]
+    made = here("calibrate", *words, "--template", chipped["part.stl"])
+    assert made.returncode == 0, made.stderr
+    (doubt,) = json.loads(made.stdout)["warnings"]
+    assert doubt.startswith("scan.xyz shows a region that would be told as missing")
+    assert "the deepest missing, by 1.2" in doubt
+    assert doubt in " ".join(made.stderr.split())
+    sound = here("calibrate", *words, "--template", chipped["broken.stl"])
+    assert json.loads(sound.stdout)["warnings"] == []
 
 
 @pytest.mark.slow

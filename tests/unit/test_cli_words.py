@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import manifold3d as m3
@@ -23,11 +24,13 @@ from typer.testing import CliRunner
 import gcode
 from amrepair.align.standing import refuse_impossible
 from amrepair.cli.approval import Terminal, confirmed
+from amrepair.cli.error_calibration import why_perhaps_not_sound
 from amrepair.cli.options import part_pose
 from amrepair.cli.repairing import pose_of_job
 from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import AlignmentError, AmrepairError, InputError
 from amrepair.policy.table import Action, Situation, decide
+from amrepair.regions import DefectType, Label, Region
 from amrepair.template import MeshSdf
 from gcode.cli import console
 from gcode.cli.app import app as gcode_app
@@ -289,6 +292,17 @@ def test_an_interrupted_print_says_how_to_go_on(
     assert run.exit_code == 130
     assert done == ["abort", "close"]
     assert "the same command goes on with --resume" in " ".join(run.stderr.split())
+
+
+def test_a_sound_part_with_defects_is_doubted() -> None:
+    """regression: what it has was learned in silence, and no longer told of other scans."""
+    chip = Region(Label.MISSING, DefectType.CHIP, 60.0, 30.0, 4.11, np.zeros((2, 3)))
+    blob = replace(chip, label=Label.EXCESS, type=DefectType.BLOB, depth_mm=1.0)
+    assert why_perhaps_not_sound("a.ply", ()) is None
+    said = why_perhaps_not_sound("a.ply", (blob, chip))
+    assert said is not None
+    assert said.startswith("a.ply shows 2 regions")
+    assert "the deepest missing, by 4.11 mm: all of this" in said
 
 
 def test_with_json_a_failure_is_one_object_too(
