@@ -209,6 +209,7 @@ def repair(
     result |= chosen.printer_json
     if turns:
         result["turns"] = [asdict(one) for one in ranked]
+    unwritten: AmrepairError | None = None
     if report is not None:
         with bars.shown(), bars.stage("report"):
             data = report_of_plan(
@@ -220,8 +221,15 @@ def repair(
                 scan_name=scan.name,
                 late=late,
             )
-            console.write_whole(report, lambda path: write_report(data, path))
-    _say(plan, result, output, ranked, late, chosen, older=older, as_json=as_json)
+            try:
+                write_report(data, report)
+            except AmrepairError as error:  # the program is there, and is told of first
+                unwritten = error
+    try:
+        _say(plan, result, output, ranked, late, chosen, older=older, as_json=as_json)
+    finally:
+        if unwritten is not None:
+            raise unwritten
 
 
 def _title(scan: Path, chosen: ChosenSetup) -> str:

@@ -184,6 +184,22 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     assert (x1, y1, z1) == pytest.approx((140.0, 110.0, 12.0), abs=0.4)
 
 
+@pytest.mark.slow
+def test_a_report_that_cannot_be_written_leaves_the_repair_told(
+    chipped: dict[str, Path], tmp_path: Path
+) -> None:
+    """regression: a temporary file was named, and nothing said of the program that was there."""
+    out, report = tmp_path / "repair.gcode", tmp_path / f"{250 * 'r'}.html"
+    words = ["repair", chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", out]
+    done = here(*words, "--part-pose", "100,80,0,0", "--report", report)
+    assert done.returncode == 2
+    (said,) = [line for line in done.stderr.splitlines() if line.startswith("amrepair:")]
+    assert said.startswith(f"amrepair: the report cannot be written to {report}: File name too")
+    assert "missing (a chip)" in done.stdout
+    assert str(out) in done.stdout.replace("\n", "")
+    assert [path.name for path in tmp_path.iterdir()] == ["repair.gcode"]
+
+
 def test_a_repair_that_is_not_needed_leaves_no_older_program(
     chipped: dict[str, Path], tmp_path: Path
 ) -> None:
