@@ -10,7 +10,7 @@ import numpy as np
 
 from amrepair.align import align
 from amrepair.errors import InputError
-from amrepair.regions import detect
+from amrepair.regions import Region, detect
 from amrepair.regions.detection import judged_scales
 from amrepair.regions.error_calibration import file_of, users_folder
 from amrepair.regions.error_calibration_fit import Sound, calibrated
@@ -39,6 +39,7 @@ def run(
     file_of(name, folder)
     bars = console.Bars()
     seen: list[Sound] = []
+    doubtful: list[str] = []
     with bars.shown():
         field = open_template(template, progress=bars)
         for path in sound:
@@ -46,11 +47,16 @@ def run(
                 cloud = read_scan(path, frame="scanner", unit=scan_unit)
             pose = align(cloud, field, rng=np.random.default_rng(seed), progress=bars)
             with bars.stage(f"look at {path.name}"):
-                seen.append(judged_scales(detect(cloud.moved(pose.template_from_scan), field)))
+                anomaly = detect(cloud.moved(pose.template_from_scan), field)
+            seen.append(judged_scales(anomaly))
+            if (doubt := why_perhaps_not_sound(path.name, anomaly.regions)) is not None:
+                doubtful.append(doubt)
     found = calibrated(name, seen, RegionOptions())
     kept = found.save(folder)
+    for doubt in doubtful:
+        console.errors.print(f"warning: {doubt}.")
     if as_json:
-        console.show_json({**asdict(found), "file": str(kept)})
+        console.show_json({**asdict(found), "file": str(kept), "warnings": doubtful})
         return
     widths = ", ".join(
         f"{wander[0]:.3f} mm over {width:g} mm"
@@ -60,4 +66,18 @@ def run(
     console.out.print(
         f"{kept}: from {len(sound)} sound {plural}; local means wander by {widths} where they are "
         f"well seen. Use it with --calibration {name}."
+    )
+
+
+def why_perhaps_not_sound(name: str, regions: Sequence[Region]) -> str | None:
+    """One sentence where a scan that is said to be of a sound part shows defects; else None."""
+    if not regions:
+        return None
+    deepest = max(regions, key=lambda region: region.depth_mm)
+    number = "a region" if len(regions) == 1 else f"{len(regions)} regions"
+    return (
+        f"{name} shows {number} that would be told as missing or too much, the deepest "
+        f"{deepest.label.name.lower()}, by {deepest.depth_mm:.2f} mm: all of this is now taken "
+        "for the scanner's own and no longer told of other scans; if the part is not sound, scan "
+        "one that is, and calibrate by the same name again"
     )

@@ -108,7 +108,7 @@ def _in_words(file: Path, marked: Marked, reader: str) -> str:
     if marked.marked_before:
         return f"{file.name} has looks in it already and was left as it is"
     count = len(marked.places)
-    said = f"{file.name}: {count} look{'s' if count > 1 else ''} for {reader}"
+    said = f"{file.name}: {count} look{'' if count == 1 else 's'} for {reader}"
     if marked.places:
         at = [f"{place.z_mm:g}" for place in marked.places]
         shown = at if len(at) <= 6 else [*at[:5], "…", at[-1]]

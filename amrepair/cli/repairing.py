@@ -34,7 +34,13 @@ from gcode.cli.options import (
     program_text,
     refuse_standing,
 )
-from gcode.cli.owning import ChosenSetup, JobMaterialOption, JobPrinterOption, chosen_setup
+from gcode.cli.owning import (
+    NOBODY_NAMED,
+    ChosenSetup,
+    JobMaterialOption,
+    JobPrinterOption,
+    chosen_setup,
+)
 from gcode.errors import GcodeError
 from gcode.profiles import DEFAULT_PROCESS
 
@@ -203,6 +209,7 @@ def repair(
     result |= chosen.printer_json
     if turns:
         result["turns"] = [asdict(one) for one in ranked]
+    unwritten: AmrepairError | None = None
     if report is not None:
         with bars.shown(), bars.stage("report"):
             data = report_of_plan(
@@ -214,8 +221,15 @@ def repair(
                 scan_name=scan.name,
                 late=late,
             )
-            console.write_whole(report, lambda path: write_report(data, path))
-    _say(plan, result, output, ranked, late, chosen, older=older, as_json=as_json)
+            try:
+                write_report(data, report)
+            except AmrepairError as error:  # the program is there, and is told of first
+                unwritten = error
+    try:
+        _say(plan, result, output, ranked, late, chosen, older=older, as_json=as_json)
+    finally:
+        if unwritten is not None:
+            raise unwritten
 
 
 def _title(scan: Path, chosen: ChosenSetup) -> str:
@@ -225,7 +239,7 @@ def _title(scan: Path, chosen: ChosenSetup) -> str:
     lines = [f"repair of {scan.name}"]
     lines += [profiles_line(chosen.ids)] if chosen.ids is not None else []
     if chosen.printer_from == "default":
-        lines.append("the printer is the default: none was named")
+        lines.append(NOBODY_NAMED)
     return "\n".join(lines)
 
 

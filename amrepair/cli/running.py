@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -120,10 +120,8 @@ def run(
             **said,
         )
     ask = begun.setting.approve == "ask"
-    # whoever supervises it ends it by SIGTERM, with nobody at a terminal
-    polite = console.signals_end_it() if shown.desk is not None else nullcontext()
     with (
-        polite,
+        console.signals_end_it(),
         live_view(shown, ask=ask, title=begun.setting.title) as page,
     ):
         report, warmth = _printed(
@@ -155,17 +153,18 @@ def _printed(
     word = page if view else bars if isinstance(bars, AtDesk) else Terminal(bars)
     machine = _machine(begun)
     try:
-        return print_run(
-            begun,
-            machine,
-            page,
-            watch,
-            bars,
-            word=word,
-            going_on=going_on,
-            pose=pose,
-            detector=detect if desk is None else SharedDetection(desk.folder, desk.judged),
-        )
+        with console.interrupts_as_such():
+            return print_run(
+                begun,
+                machine,
+                page,
+                watch,
+                bars,
+                word=word,
+                going_on=going_on,
+                pose=pose,
+                detector=detect if desk is None else SharedDetection(desk.folder, desk.judged),
+            )
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "

@@ -21,6 +21,7 @@ PAUSE_COMMANDS: Mapping[Target, tuple[str, ...]] = {
     "reprap": ("M226",),
     "octoprint": ("@amrepair scan layer={layer} z={z}",),
 }
+BYTE_ORDER_MARK = "\ufeff"  # before a file's first line, where an editor on Windows saved it
 _FIELDS = ("layer", "z")
 _FLAVOURS: Mapping[str, Target] = {
     "klipper": "klipper",
@@ -47,7 +48,7 @@ def target_of(text: str, name: str, environment: Mapping[str, str]) -> Target:
     """
     if environment.get("SLIC3R_PP_HOST", "").lower() == "octoprint":
         return "octoprint"
-    own = own_settings(text, name)
+    own = own_settings(text.removeprefix(BYTE_ORDER_MARK), name)
     flavour = environment.get("SLIC3R_GCODE_FLAVOR", "").strip().lower()
     if own is not None and own.machine is not None and own.machine.startswith("prusa_"):
         return "prusa"

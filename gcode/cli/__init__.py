@@ -4,9 +4,21 @@ Exit 0 done, 2 bad input or refused, 4 printer or link. `--json` prints one obje
 output; messages and progress go to standard error.
 """
 
-from gcode.cli.app import main
+import sys
+
 from gcode.process import prepare
 
 prepare()  # before numpy is loaded, which a command line does late
 
 __all__ = ["main"]
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        from gcode.cli.app import main as run
+
+        run()
+    except KeyboardInterrupt:  # while the libraries were loading
+        sys.stderr.write("gcode: interrupted\n")
+        sys.exit(130)

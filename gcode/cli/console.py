@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import Any, TypeVar
 
 import typer
@@ -63,6 +63,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 _circles_left: list[bool] = []
+_interrupts: list[int] = []  # of the command under way: Ctrl+C, and what ends it likewise
 
 
 class _TimeLeft(TimeRemainingColumn):
@@ -267,6 +268,7 @@ def signals_end_it() -> Iterator[None]:
     """
 
     def interrupt(number: int, frame: object) -> None:
+        _interrupts.append(number)
         raise KeyboardInterrupt
 
     ends = {signal.SIGTERM}
@@ -282,6 +284,39 @@ def signals_end_it() -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
 
 
+@contextmanager
+def interrupts_as_such() -> Iterator[None]:
+    """Within it an interrupt is one wherever it comes: compiled code makes an error of it."""
+    try:
+        yield
+    except SystemError as error:
+        cause = error.__cause__
+        while isinstance(cause, SystemError):
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from None
+        raise
+
+
+@contextmanager
+def _interrupts_noted() -> Iterator[None]:
+    """Note every interrupt, which is told as ever: what it comes to is not always told as one."""
+
+    def note(number: int, frame: FrameType | None) -> None:
+        _interrupts.append(number)
+        signal.default_int_handler(number, frame)
+
+    _interrupts.clear()
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield  # ignored, or somebody else's
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:
     """Run an application; a known error becomes one sentence and its exit code.
 
@@ -293,7 +328,8 @@ def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     for library in ("trimesh", "tifffile"):  # they log tracebacks; what is wrong we tell once
         logging.getLogger(library).setLevel(logging.CRITICAL)
-    code = _exit_code(app, name, known)
+    with _interrupts_noted():
+        code = _exit_code(app, name, known)
     if _circles_left:
         gc.freeze()
     sys.exit(code)  # no error is alive any more, nor what it held
@@ -338,6 +374,11 @@ def _ended(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> i
         raise
     except OSError as error:
         return _failed(f"{name}: {in_words(error)}", InputError.exit_code)
+    except Exception:
+        # of an interrupt in compiled code, or while a library loads that swallows it (trimesh)
+        if not _interrupts:
+            raise
+        code = INTERRUPTED
     if code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word
         return _failed(f"{name}: interrupted", code)
     return code if isinstance(code, int) else 0

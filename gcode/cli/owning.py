@@ -34,6 +34,8 @@ JobMaterialOption = Annotated[
         autocompletion=console.profile_ids("materials"),
     ),
 ]
+NOBODY_NAMED = "the printer is the default: none was named"
+"""What a program says for people where nobody chose its printer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,22 @@ class ChosenSetup:
             "printer_name": printer.name,
             "printer_from": self.printer_from,
         }
+
+    def about_printer(self, text: str) -> tuple[str, ...]:
+        """Comments for a program made of a job: by them a later command knows the printer.
+
+        The profiles' names; where the job's own settings made them, those of its lines that a
+        program without the job's beginning would lose.
+        """
+        from gcode.profiles.importers.jobs import settings_ahead
+        from gcode.profiles.own_settings import printer_line, profiles_line
+
+        if self.ids is None:
+            return tuple(settings_ahead(text))
+        lines = [profiles_line(self.ids), printer_line(self.setup.printer)]
+        if self.printer_from == "default":
+            lines.append(NOBODY_NAMED)
+        return tuple(f"; {line}" for line in lines)
 
 
 def job_setup(

@@ -19,7 +19,7 @@ from gcode.cli.options import (
 from gcode.cli.owning import (
     JobMaterialOption,
     JobPrinterOption,
-    job_setup,
+    chosen_setup,
     told_if_for_another,
 )
 
@@ -55,7 +55,8 @@ def resume_at_command(
     console.writable(output)
     refuse_standing(standing)
     text = program_text(job)
-    setup, _ = job_setup(text, job, printer, material)
+    chosen = chosen_setup(text, job, printer, material)
+    setup = chosen.setup
     bars = console.Bars()
     with bars.shown(), told_if_for_another(text, job, setup.printer):
         made = resume_at(
@@ -65,6 +66,7 @@ def resume_at_command(
             layer=layer,
             without=without,
             title=job.name,
+            about_printer=chosen.about_printer(text),
             progress=bars,
         )
     program = made.checked.program

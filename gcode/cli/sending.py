@@ -123,7 +123,7 @@ def send(
         with bars.shown(), bars.stage("connect"):
             machine.connect()  # a printer that refuses us is not ours to abort
     try:
-        with console.signals_end_it(), bars.shown():
+        with console.signals_end_it(), console.interrupts_as_such(), bars.shown():
             if resume and isinstance(machine, SerialPrinter):
                 report = resume_job(
                     machine,
@@ -135,8 +135,13 @@ def send(
             else:
                 report = machine.print(checked, progress=bars)
             machine.finish_moves()
-    except BaseException:
+    except BaseException as error:
         _abort(machine)
+        if isinstance(error, KeyboardInterrupt) and isinstance(machine, SerialPrinter):
+            console.errors.print(
+                "When somebody has looked, the same command goes on with --resume, while the bed "
+                "is warm and the printer is not switched off."
+            )
         raise
     finally:
         machine.close()

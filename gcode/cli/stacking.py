@@ -13,7 +13,7 @@ from gcode.cli.options import JsonOption, ProgramOutput, program_text, standing_
 from gcode.cli.owning import (
     JobMaterialOption,
     JobPrinterOption,
-    job_setup,
+    chosen_setup,
     told_if_for_another,
 )
 
@@ -45,12 +45,18 @@ def print_onto_command(
 
     console.writable(output)
     text = program_text(job)
-    setup, _ = job_setup(text, job, printer, material)
+    chosen = chosen_setup(text, job, printer, material)
+    setup = chosen.setup
     field = standing_on_bed(part, setup.printer)
     bars = console.Bars()
     with bars.shown(), told_if_for_another(text, job, setup.printer):
         made = print_onto(
-            Program(text, setup.printer.dialect), setup, field, title=job.name, progress=bars
+            Program(text, setup.printer.dialect),
+            setup,
+            field,
+            title=job.name,
+            about_printer=chosen.about_printer(text),
+            progress=bars,
         )
     program = made.checked.program
     console.write_text(output, program.text)

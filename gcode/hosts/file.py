@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -42,19 +44,18 @@ class FilePrinter:
 
     def connect(self) -> None:
         """Begin the file."""
-        try:
+        if self.path.is_dir():
+            raise InputError(f"{self.path} cannot be written: it is a folder; name a file in it.")
+        with self._told():
             self._file = self._temporary.open("w", encoding="utf-8", newline="\n")
-        except OSError as error:
-            raise InputError(
-                f"{self.path} cannot be written ({error.strerror}); name another file."
-            ) from error
 
     def close(self) -> None:
         """Put the file in place."""
         if self._file is not None:
-            self._file.close()
+            with self._told():
+                self._file.close()
+                self._temporary.replace(self.path)
             self._file = None
-            self._temporary.replace(self.path)
 
     def capabilities(self) -> Capabilities:
         """Return what a file can do: nothing."""
@@ -84,10 +85,11 @@ class FilePrinter:
         whole = text.count("\n") + (not text.endswith("\n"))  # no line follows the last newline
         first, end = (0, whole) if lines is None else (lines.start, min(lines.stop, whole))
         written, size = 0, 0
-        for line in checked.lines(first, end):
-            self._file.write(line + "\n")
-            written += bool(line.partition(";")[0].strip())
-            size += len(line) + 1
+        with self._told():
+            for line in checked.lines(first, end):
+                self._file.write(line + "\n")
+                written += bool(line.partition(";")[0].strip())
+                size += len(line) + 1
         progress("writing", 1.0, 1.0)
         seconds = time.monotonic() - start_s
         return PrintReport(True, written, size, seconds, next_line=end, first_line=first)
@@ -104,9 +106,21 @@ class FilePrinter:
     def abort(self) -> None:
         """Drop the file."""
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # what a full disk did not take is not wanted any more
+                self._file.close()
             self._file = None
             self._temporary.unlink(missing_ok=True)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Within it, what the system refuses is told of the file, and no part of it stays."""
+        try:
+            yield
+        except OSError as error:
+            self.abort()
+            raise InputError(
+                f"{self.path} cannot be written ({error.strerror}); name another file."
+            ) from error
 
     def emergency_stop(self) -> None:
         """Drop the file."""

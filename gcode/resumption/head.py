@@ -59,6 +59,7 @@ def continued(
     standing: HeightField,
     reach: HeightField,
     about: Sequence[str],
+    about_printer: Sequence[str],
     progress: Progress,
 ) -> Continued:
     """Bring a cold machine to where a job's nozzle is before a line, and go on from there.
@@ -74,6 +75,8 @@ def continued(
         prime.
     about
         Comments at the program's head.
+    about_printer
+        Comment lines that tell of the printer and that stand before `line` in the job.
 
     Raises
     ------
@@ -85,6 +88,7 @@ def continued(
     head = Head(setup, state, clear_mm=height_over(standing.top_mm, state, printer))
     told = "Z is not homed: the printer has been on all the time, or has been told its Z anew"
     head.comment(*about, told)
+    head.lines += about_printer
     head.lift_and_home(settings)
     head.heat(hotends_c, bed_c)
     primed = _prime(head, reach, printer)

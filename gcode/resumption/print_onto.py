@@ -7,6 +7,7 @@ homed; the beginning is as in `resume_at`, and the checker judges all of it with
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,6 +52,7 @@ def print_onto(
     standing: HeightField,
     *,
     title: str = "a job",
+    about_printer: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Stacked:
     """Move a job up onto what stands there.
@@ -61,6 +63,8 @@ def print_onto(
         The whole job, of any slicer, placed in X and Y where it is to stand on the part.
     standing
         What stands on the bed, build frame.
+    about_printer
+        Comment lines of the program that tell for which printer it is.
 
     Raises
     ------
@@ -79,7 +83,8 @@ def print_onto(
         job, line, _raised(lines, raised_mm, absolute=state.absolute_xyz, first=line), setup,
         state=replace(state, position_mm=(x, y, z + raised_mm)),
         standing=standing, reach=over_reach(standing, setup.printer),
-        about=[f"{title}, raised by {raised_mm:g} mm onto what stands there"], progress=progress,
+        about=[f"{title}, raised by {raised_mm:g} mm onto what stands there"],
+        about_printer=about_printer, progress=progress,
     )  # fmt: skip
     return Stacked(made.checked, made.hotend_c, made.bed_c, made.primed, raised_mm, uneven_mm)
 

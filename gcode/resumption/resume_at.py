@@ -54,6 +54,7 @@ def resume_at(
     layer: int | None = None,
     without: str | None = None,
     title: str = "a job",
+    about_printer: Sequence[str] = (),
     progress: Progress = silent,
 ) -> Resumption:
     """Make the job that is left when a part stands up to a layer.
@@ -68,6 +69,8 @@ def resume_at(
         Instead of a height: index of the first layer to be printed, from 0.
     without
         An object of the job of which nothing more is printed; what stands of it stays.
+    about_printer
+        Comment lines of the program that tell for which printer it is.
 
     Raises
     ------
@@ -91,7 +94,7 @@ def resume_at(
             f"{title}, from layer {first.index} on, whose top is at {first.z_mm:g} mm",
             f"up to {field.top_mm:g} mm the part stands there already",
         ],
-        progress=progress,
+        about_printer=about_printer, progress=progress,
     )  # fmt: skip
     return Resumption(made.checked, made.hotend_c, made.bed_c, made.primed, field, first, line)
 

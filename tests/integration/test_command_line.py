@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from amrepair.cli import error_calibration
 from tests.commands import ROOT, here
 
 KNOB = ROOT / "examples" / "parts" / "knob.stl"
@@ -183,6 +184,22 @@ def test_offline_repair_of_a_chipped_block(chipped: dict[str, Path], tmp_path: P
     assert (x1, y1, z1) == pytest.approx((140.0, 110.0, 12.0), abs=0.4)
 
 
+@pytest.mark.slow
+def test_a_report_that_cannot_be_written_leaves_the_repair_told(
+    chipped: dict[str, Path], tmp_path: Path
+) -> None:
+    """regression: a temporary file was named, and nothing said of the program that was there."""
+    out, report = tmp_path / "repair.gcode", tmp_path / f"{250 * 'r'}.html"
+    words = ["repair", chipped["scan.xyz"], "--template", chipped["part.stl"], "-o", out]
+    done = here(*words, "--part-pose", "100,80,0,0", "--report", report)
+    assert done.returncode == 2
+    (said,) = [line for line in done.stderr.splitlines() if line.startswith("amrepair:")]
+    assert said.startswith(f"amrepair: the report cannot be written to {report}: File name too")
+    assert "missing (a chip)" in done.stdout
+    assert str(out) in done.stdout.replace("\n", "")
+    assert [path.name for path in tmp_path.iterdir()] == ["repair.gcode"]
+
+
 def test_a_repair_that_is_not_needed_leaves_no_older_program(
     chipped: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -239,6 +256,23 @@ def test_align_and_detect_write_what_the_contract_says(
     assert {"object_score", "threshold", "regions", "symmetric_alternatives", "inlier_ratio",
             "clutter_ratio"} <= set(told)  # fmt: skip
     assert told["regions"][0]["volume_mm3"] == pytest.approx(8 * 8 * 1.2, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_calibration_by_a_part_that_is_not_sound_is_doubted(
+    chipped: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: a scan with dents was learned from in silence, and hid such dents ever after."""
+    monkeypatch.setattr(error_calibration, "users_folder", lambda: tmp_path)
+    words = ["--sound", chipped["scan.xyz"], "--name", "bench", "--json"]
+    made = here("calibrate", *words, "--template", chipped["part.stl"])
+    assert made.returncode == 0, made.stderr
+    (doubt,) = json.loads(made.stdout)["warnings"]
+    assert doubt.startswith("scan.xyz shows a region that would be told as missing")
+    assert "the deepest missing, by 1.2" in doubt
+    assert doubt in " ".join(made.stderr.split())
+    sound = here("calibrate", *words, "--template", chipped["broken.stl"])
+    assert json.loads(sound.stdout)["warnings"] == []
 
 
 @pytest.mark.slow

@@ -284,6 +284,42 @@ def test_the_command_line_makes_it_and_prints_it(tmp_path: Path) -> None:
     assert state["hotend_target_c"] == state["bed_target_c"] == 0
 
 
+SLICED = "; profiles: ender_3, petg, standard_0.20"
+CURAS = ";FLAVOR:Marlin\n;TIME:666\n;Layer height: 0.2\n;TARGET_MACHINE.NAME:Creality Ender-3"
+AHEAD = (
+    "; HEADER_BLOCK_START\n; CONFIG_BLOCK_START\n; printer_settings_id = Mine\n"
+    "; printable_area = 0x0,220x0,220x220,0x220"
+    "\n; CONFIG_BLOCK_END"
+)
+
+
+@pytest.mark.parametrize(
+    ("head", "words", "printer"),
+    [
+        (SLICED, [], "Creality Ender-3"),
+        (CURAS, [], "Creality Ender-3"),
+        (AHEAD, [], "Mine"),
+        ("; a job", ["--printer", "ender_3"], "Creality Ender-3"),
+        (CURAS, ["--printer", "generic_marlin"], "Generic Marlin printer"),
+    ],
+)
+def test_what_is_left_of_a_job_is_for_the_jobs_printer(
+    head: str, words: list[str], printer: str, tmp_path: Path
+) -> None:
+    """regression: it was judged, and sent, as for the default printer."""
+    job, out = tmp_path / "job.gcode", tmp_path / "rest.gcode"
+    job.write_text(f"{head}\n{tower(4.0).text}")
+    made = here("resume-at", job, "--layer", "10", *words, "-o", out, program="gcode")
+    assert made.returncode == 0, made.stderr
+    field = tmp_path / "stands.npz"
+    resume_at(tower(4.0), setup_for("ender_3"), layer=10).standing.write(field)
+    judged = here("check", out, "--as-built", field, "--json", program="gcode")
+    told = json.loads(judged.stdout)
+    assert (told["printer_name"], told["printer_from"]) == (printer, "job")
+    assert told["other_printer"] is None
+    assert "TIME:" not in out.read_text()  # it is not what is left of it
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -7,8 +7,11 @@ import io
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import manifold3d as m3
@@ -16,15 +19,18 @@ import numpy as np
 import pytest
 import typer
 from rich.console import Console
+from typer.testing import CliRunner
 
 import gcode
 from amrepair.align.standing import refuse_impossible
 from amrepair.cli.approval import Terminal, confirmed
+from amrepair.cli.error_calibration import why_perhaps_not_sound
 from amrepair.cli.options import part_pose
 from amrepair.cli.repairing import pose_of_job
 from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import AlignmentError, AmrepairError, InputError
 from amrepair.policy.table import Action, Situation, decide
+from amrepair.regions import DefectType, Label, Region
 from amrepair.template import MeshSdf
 from gcode.cli import console
 from gcode.cli.app import app as gcode_app
@@ -33,7 +39,8 @@ from gcode.cli.words import what_it_does
 from gcode.errors import InputError as GcodeInputError
 from gcode.errors import LinkError
 from gcode.estimate import estimate
-from gcode.hosts.port import Temperatures
+from gcode.hosts.port import PrintReport, Temperatures
+from gcode.hosts.serial import SerialPrinter
 from gcode.moves import Program
 from gcode.slicing.job import plan_part
 from gcode.writer import write
@@ -215,6 +222,87 @@ def test_every_end_has_its_code_and_one_sentence(
     told = capsys.readouterr().err.strip()
     assert said in told
     assert len(told.splitlines()) == bool(said)
+
+
+def test_an_interrupt_that_a_library_swallows_is_told_as_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """regression: Ctrl+C while trimesh was loading ended in a traceback and exit code 1."""
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.command()
+    def go(pressed: bool = False) -> None:
+        with suppress(KeyboardInterrupt):
+            if pressed:
+                signal.raise_signal(signal.SIGINT)
+        raise TypeError("unsupported operand: 'ExceptionWrapper'")
+
+    monkeypatch.setattr("sys.argv", ["amrepair", "--pressed"])
+    with pytest.raises(SystemExit) as end:
+        console.run(app, "amrepair", (AmrepairError,))
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "amrepair: interrupted\n"
+    monkeypatch.setattr("sys.argv", ["amrepair"])
+    with pytest.raises(TypeError):  # a fault of ours is no interrupt
+        console.run(app, "amrepair", (AmrepairError,))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupt_while_libraries_load_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """regression: `gcode` ended in a traceback."""
+
+    class Pressed:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "gcode.cli.app":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "gcode.cli.app")
+    monkeypatch.delattr(gcode.cli, "app", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Pressed(), *sys.meta_path])
+    with pytest.raises(SystemExit) as end:
+        gcode.cli.main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "gcode: interrupted\n"
+
+
+def test_an_interrupted_print_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: it said "interrupted" alone."""
+    done: list[str] = []
+
+    class Interrupted(SerialPrinter):
+        def __init__(self, *_: object, **__: object) -> None: ...
+        def connect(self) -> None: ...
+        def abort(self) -> None:
+            done.append("abort")
+
+        def close(self) -> None:
+            done.append("close")
+
+        def print(self, *_: object, **__: object) -> PrintReport:
+            raise KeyboardInterrupt
+
+    job = tmp_path / "job.gcode"
+    job.write_text("G28\nM104 S0\n")
+    monkeypatch.setattr("gcode.hosts.connect", Interrupted)
+    run = CliRunner().invoke(gcode_app, ["send", str(job), "--port", "/dev/ttyACM0"])
+    assert run.exit_code == 130
+    assert done == ["abort", "close"]
+    assert "the same command goes on with --resume" in " ".join(run.stderr.split())
+
+
+def test_a_sound_part_with_defects_is_doubted() -> None:
+    """regression: what it has was learned in silence, and no longer told of other scans."""
+    chip = Region(Label.MISSING, DefectType.CHIP, 60.0, 30.0, 4.11, np.zeros((2, 3)))
+    blob = replace(chip, label=Label.EXCESS, type=DefectType.BLOB, depth_mm=1.0)
+    assert why_perhaps_not_sound("a.ply", ()) is None
+    said = why_perhaps_not_sound("a.ply", (blob, chip))
+    assert said is not None
+    assert said.startswith("a.ply shows 2 regions")
+    assert "the deepest missing, by 4.11 mm: all of this" in said
 
 
 def test_with_json_a_failure_is_one_object_too(

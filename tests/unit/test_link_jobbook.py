@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sqlite3
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import IO, cast
 
 import pytest
 
@@ -15,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
+from gcode.errors import InputError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts.file import FilePrinter
 from gcode.hosts.jobbook import JobBook
@@ -110,6 +113,36 @@ def test_a_file_says_which_part_it_took(tmp_path: Path, monkeypatch: pytest.Monk
     with FilePrinter(tmp_path / "part.gcode") as printer:
         report = printer.print(program(moves(9)), lines=range(3, 6))
     assert (report.first_line, report.next_line, report.lines_acked) == (3, 6, 3)
+
+
+class _Full:
+    """A file on a disk without room: it tells when it is flushed, and again when it is closed."""
+
+    def write(self, line: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def close(self) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_what_cannot_be_written_is_told_of_the_file_and_leaves_none(
+    written: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: it was told of a temporary file, which stayed."""
+    monkeypatch.setattr("gcode.hosts.file.require_checked", lambda checked: None)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="folder cannot be written: it is a folder"):
+        FilePrinter(tmp_path / "folder").connect()
+    printer = FilePrinter(tmp_path / "part.gcode")
+    printer.connect()
+    assert printer._file is not None
+    printer._file.close()
+    printer._file = cast("IO[str]", _Full())
+    with pytest.raises(InputError, match=r"part\.gcode cannot be written \(No space"):
+        printer.print(program(moves(9))) if written else printer.close()
+    printer.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
 def test_a_file_is_the_program_and_nothing_more(

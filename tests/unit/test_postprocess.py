@@ -193,6 +193,17 @@ def test_a_prusas_own_pause_is_chosen_by_the_jobs_settings() -> None:
     assert target_of(text, "job.gcode", {"SLIC3R_GCODE_FLAVOR": "marlin2"}) == "prusa"
 
 
+def test_a_mark_of_byte_order_hides_no_settings(tmp_path: Path) -> None:
+    """regression: Windows' editors put one before Cura's first setting."""
+    head = "\ufeff;FLAVOR:Marlin\n;Layer height: 0.2\n"
+    assert target_of(f"{head}G28\n", "job.gcode", {}) == "marlin"
+    file = tmp_path / "job.gcode"
+    file.write_text(head + job(), encoding="utf-8")
+    run = CliRunner().invoke(app, ["postprocess", "--every", "0", "--no-final", str(file)])
+    assert "0 looks for marlin" in run.stderr
+    assert file.read_text(encoding="utf-8") == head + job()
+
+
 def test_nobody_tells_who_reads() -> None:
     with pytest.raises(InputError, match="say it by --for"):
         target_of(job(), "job.gcode", {})

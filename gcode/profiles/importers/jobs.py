@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gcode.errors import InputError
-from gcode.profiles.importers.cura import CURA, HEAD_CHARACTERS, read_cura
+from gcode.profiles.importers.cura import CURA, HEAD_CHARACTERS, HEADER, read_cura
 from gcode.profiles.importers.rules import Rule, Source, number
 from gcode.profiles.importers.slicers import ORCA, PROFILE_NAMES, PRUSA, REASONS
 from gcode.profiles.names import Kind
@@ -35,6 +35,8 @@ _KLIPPERS = re.compile(
 )
 # A tool's temperatures, a macro of the card, no tool at all.
 _REPRAPS = re.compile(r"^(?:G10 P\d|M98 P|T-1\b)", re.MULTILINE)
+_CURA_MADE = re.compile(r"^;Generated with (Cura\S* ?\S*)", re.MULTILINE)
+_FIRST_COMMAND = re.compile(r"^[ \t]*[^;\s]", re.MULTILINE)
 _LEAST_KEYS = 20  # a configuration has hundreds; fewer are comments of somebody's
 # OrcaSlicer keeps a temperature for each of its plates, and which of them lies there.
 _PLATES = {
@@ -103,8 +105,23 @@ def generator(text: str) -> str:
         found = pattern.search(head)
         if found is not None:
             return found.group(1).strip()
-    cura = re.search(r"^;Generated with (Cura\S* ?\S*)", head, re.MULTILINE)
+    cura = _CURA_MADE.search(head)
     return cura.group(1) if cura is not None else ""
+
+
+def settings_ahead(text: str) -> list[str]:
+    """The lines by which `read_settings` knows a job, of those before its first command.
+
+    What stands behind the commands is not among them.
+    """
+    command = _FIRST_COMMAND.search(text)
+    head = text if command is None else text[: command.start()]
+    for begin, end in BLOCK_MARKS:
+        block = re.search(f"^{begin}$.*?^{end}$", head, re.MULTILINE | re.DOTALL)
+        if block is not None:
+            return block[0].split("\n")
+    of_cura = re.compile(f"{HEADER.pattern}|{_CURA_MADE.pattern}", re.MULTILINE)
+    return [line[0] for line in of_cura.finditer(head[:HEAD_CHARACTERS])]
 
 
 def _between(name: str, text: str, begin: str, end: str) -> dict[str, str] | None:

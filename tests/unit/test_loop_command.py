@@ -1,0 +1,68 @@
+"""The command `amrepair loop`, as far as it is wiring."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from amrepair.cli import running
+from amrepair.cli.live import NoView, ViewPlace
+from amrepair.repair import Stopwatch
+from gcode.cli import console
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_loop_that_is_told_to_end_takes_its_safe_exits(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: it was killed on the spot, without a word, where no fleet supervised it."""
+
+    def printed(*_: Any, **__: Any) -> None:
+        signal.raise_signal(number)
+        pytest.fail("it goes on")
+
+    setting = SimpleNamespace(approve="auto", title="a job")
+    monkeypatch.setattr(running, "gone_on_with", lambda *_: SimpleNamespace(setting=setting))
+    monkeypatch.setattr(running, "_printed", printed)
+    said: dict[str, Any] = dict.fromkeys(("port", "scanner", "approve"))
+    with pytest.raises(KeyboardInterrupt):
+        running.run(
+            None,
+            None,
+            Path(),
+            (None, None, "repair_0.20"),
+            running.Looks(),
+            None,
+            ViewPlace(False, "127.0.0.1", 0, None),
+            resume=Path("run"),
+            pose_confirmed=False,
+            as_json=False,
+            **said,
+        )
+    assert signal.getsignal(number) is signal.SIG_DFL
+
+
+def test_an_interrupt_in_compiled_code_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """regression: numba makes a SystemError of it, which ended in a traceback and exit code 1."""
+    closed: list[bool] = []
+
+    def judging(*_: Any, **__: Any) -> None:
+        inner = SystemError("_numba_unpickle returned a result with an exception set")
+        inner.__cause__ = KeyboardInterrupt()
+        raise SystemError("CPUDispatcher returned a result with an exception set") from inner
+
+    machine = SimpleNamespace(close=lambda: closed.append(True))
+    monkeypatch.setattr(running, "_machine", lambda _: machine)
+    monkeypatch.setattr(running, "print_run", judging)
+    begun: Any = SimpleNamespace(folder=SimpleNamespace(path="out/loop"))
+    how: dict[str, Any] = {"view": False, "going_on": False, "pose": False, "desk": None}
+    with pytest.raises(KeyboardInterrupt):
+        running._printed(begun, NoView(), Stopwatch(), console.Bars(), **how)
+    assert "go on with: amrepair loop --resume out/loop" in capsys.readouterr().err
+    assert closed
