@@ -89,18 +89,22 @@ def _run(
 
     options, calibration = judging(seed=seed, sensors_mm=_places(sensor_at), scan_unit=scan_unit)
     bars = console.Bars()
-    with console.signals_end_it(), bars.shown():
-        report = run_batch(
-            source,
-            options=options,
-            template=template,
-            out=out,
-            executor=executor,
-            workers=workers,
-            address=address,
-            calibration=calibration_named(calibration),
-            progress=bars,
-        )
+    try:
+        with console.signals_end_it(), bars.shown():
+            report = run_batch(
+                source,
+                options=options,
+                template=template,
+                out=out,
+                executor=executor,
+                workers=workers,
+                address=address,
+                calibration=calibration_named(calibration),
+                progress=bars,
+            )
+    except KeyboardInterrupt:
+        console.errors.print(f"What is judged is kept in {out}; the same command goes on with it.")
+        raise
     for note in report.notes:
         console.errors.print(note)
     if as_json:

@@ -11,7 +11,7 @@ import signal
 import stat
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, TypeVar
@@ -63,7 +63,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 _circles_left: list[bool] = []
-_interrupts: list[int] = []  # of the command under way: Ctrl+C, and what ends it likewise
+_interrupts: list[list[int]] = []  # of the command under way, where `run` runs one: Ctrl+C, …
 
 
 class _TimeLeft(TimeRemainingColumn):
@@ -148,12 +148,14 @@ class Bars:
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """Say so while libraries load: from a cold disk that takes seconds."""
-    if not errors.is_terminal:
+    """Say so while libraries load: from a cold disk that takes seconds.
+
+    An interrupt that one of them swallows (trimesh) comes after it.
+    """
+    with errors.status("loading") if errors.is_terminal else nullcontext():
         yield
-        return
-    with errors.status("loading"):
-        yield
+    if _interrupted():
+        raise KeyboardInterrupt
 
 
 def application(name: str, about: str, package: ModuleType) -> typer.Typer:
@@ -268,7 +270,7 @@ def signals_end_it() -> Iterator[None]:
     """
 
     def interrupt(number: int, frame: object) -> None:
-        _interrupts.append(number)
+        _note(number)
         raise KeyboardInterrupt
 
     ends = {signal.SIGTERM}
@@ -303,18 +305,28 @@ def _interrupts_noted() -> Iterator[None]:
     """Note every interrupt, which is told as ever: what it comes to is not always told as one."""
 
     def note(number: int, frame: FrameType | None) -> None:
-        _interrupts.append(number)
+        _note(number)
         signal.default_int_handler(number, frame)
 
-    _interrupts.clear()
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield  # ignored, or somebody else's
-        return
-    signal.signal(signal.SIGINT, note)
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if ours:  # it is neither ignored nor somebody else's
+        signal.signal(signal.SIGINT, note)
+    _interrupts.append([])
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        _interrupts.pop()
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _note(number: int) -> None:
+    for under_way in _interrupts[-1:]:
+        under_way.append(number)
+
+
+def _interrupted() -> bool:
+    return any(_interrupts[-1:])
 
 
 def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:
@@ -376,7 +388,7 @@ def _ended(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> i
         return _failed(f"{name}: {in_words(error)}", InputError.exit_code)
     except Exception:
         # of an interrupt in compiled code, or while a library loads that swallows it (trimesh)
-        if not _interrupts:
+        if not _interrupted():
             raise
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word

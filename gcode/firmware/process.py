@@ -105,7 +105,11 @@ class EmulatedPrinterProcess:
         self._socket = ours
         self._reader = threading.Thread(target=self._read, daemon=True, name="emulated-motion")
         self._reader.start()
-        self._answer()
+        try:
+            self._answer()
+        except BaseException:  # an interrupt: nobody holds yet what would stop the printer
+            self.stop()
+            raise
 
     @property
     def pid(self) -> int:

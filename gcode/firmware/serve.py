@@ -287,7 +287,9 @@ def serve_forever(
             try:
                 file = stack.enter_context(motion.open("ab"))
             except OSError as error:
-                raise InputError(f"{motion}: the motion cannot be written ({error}).") from error
+                raise InputError(
+                    f"{motion}: the motion cannot be written ({error.strerror})."
+                ) from error
         server = PtyServer(core, link, motion=file)
         if on_port is not None:
             on_port(str(link))

@@ -231,17 +231,22 @@ def test_an_interrupt_that_a_library_swallows_is_told_as_one(
     app = typer.Typer(pretty_exceptions_enable=False)
 
     @app.command()
-    def go(pressed: bool = False) -> None:
-        with suppress(KeyboardInterrupt):
-            if pressed:
-                signal.raise_signal(signal.SIGINT)
-        raise TypeError("unsupported operand: 'ExceptionWrapper'")
+    def go(pressed: bool = False, fails: bool = False) -> None:
+        with console.starting():
+            with suppress(KeyboardInterrupt):
+                if pressed:
+                    signal.raise_signal(signal.SIGINT)
+            if fails:
+                raise TypeError("unsupported operand: 'ExceptionWrapper'")
+        assert not pressed, "it goes on"
+        raise TypeError
 
-    monkeypatch.setattr("sys.argv", ["amrepair", "--pressed"])
-    with pytest.raises(SystemExit) as end:
-        console.run(app, "amrepair", (AmrepairError,))
-    assert end.value.code == 130
-    assert capsys.readouterr().err == "amrepair: interrupted\n"
+    for words in (["--pressed"], ["--pressed", "--fails"]):
+        monkeypatch.setattr("sys.argv", ["amrepair", *words])
+        with pytest.raises(SystemExit) as end:
+            console.run(app, "amrepair", (AmrepairError,))
+        assert end.value.code == 130
+        assert capsys.readouterr().err == "amrepair: interrupted\n"
     monkeypatch.setattr("sys.argv", ["amrepair"])
     with pytest.raises(TypeError):  # a fault of ours is no interrupt
         console.run(app, "amrepair", (AmrepairError,))

@@ -413,3 +413,20 @@ def test_a_touch_that_meets_nothing_leaves_the_link_as_it_was() -> None:
     thread.join(10)
     assert heard.count(b"G1 Z5 F600") == 1
     assert not any(b"CLEAR_HOMED" in line for line in heard), "Z was put right"
+
+
+def test_an_interrupt_while_an_emulated_printer_starts_leaves_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """regression: it came up on its own, found its folder gone, and ended in a traceback."""
+    started: list[int] = []
+
+    def pressed(printer: EmulatedPrinterProcess) -> dict[str, object]:
+        started.append(printer.pid)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(EmulatedPrinterProcess, "_answer", pressed)
+    with pytest.raises(KeyboardInterrupt):
+        EmulatedPrinterProcess(printer=profile())
+    with pytest.raises(ProcessLookupError):
+        os.kill(started[0], 0)

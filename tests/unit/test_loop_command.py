@@ -1,4 +1,4 @@
-"""The command `amrepair loop`, as far as it is wiring."""
+"""The commands `amrepair loop` and `batch`, as far as they are wiring: how they end."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from amrepair.cli import running
+from amrepair.cli.app import app
 from amrepair.cli.live import NoView, ViewPlace
 from amrepair.repair import Stopwatch
 from gcode.cli import console
@@ -44,6 +46,21 @@ def test_a_loop_that_is_told_to_end_takes_its_safe_exits(
             **said,
         )
     assert signal.getsignal(number) is signal.SIG_DFL
+
+
+def test_an_interrupted_batch_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """regression: it said "interrupted" alone."""
+
+    def judging(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("amrepair.batch.run_batch", judging)
+    words = ["batch", "detect", str(tmp_path), "--template", "part.stl", "--out", "out/batch"]
+    run = CliRunner().invoke(app, words)
+    assert run.exit_code == 130
+    assert "kept in out/batch; the same command goes on with it." in " ".join(run.stderr.split())
 
 
 def test_an_interrupt_in_compiled_code_says_how_to_go_on(
