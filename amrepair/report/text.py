@@ -238,7 +238,8 @@ def _left(outcome: Outcome, figures: Figures) -> str:
         parts.append(f"{quantity(figures.missing_mm3_after, 'mm³')} still missing")
     else:
         looks = " that a look shows" if figures.covered_mm3 > NEGLIGIBLE_MM3 else ""
-        parts.append(f"Nothing is missing any more{looks}")
+        was = figures.missing_mm3_before > NEGLIGIBLE_MM3 or figures.filament_mm > 0
+        parts.append(f"Nothing is missing{' any more' if was else ''}{looks}")
     if figures.covered_mm3 > NEGLIGIBLE_MM3:
         parts.append(
             f"{quantity(figures.covered_mm3, 'mm³')} that the nozzle did not get to are covered now"

@@ -350,6 +350,12 @@ def test_a_plan_that_leaves_something_is_not_said_to_be_printed() -> None:
     assert "has not been printed" in said
 
 
+@pytest.mark.parametrize(("before_mm3", "said"), [(0.0, "missing."), (44.0, "missing any more.")])
+def test_what_never_was_missing_is_not_missing_any_more(before_mm3: float, said: str) -> None:
+    figures = Figures(before_mm3, 0.0, 0.0, None, None, 0.0, 0.0, 1, 0.0, 0.0)
+    assert summary(Outcome.NOTHING_TO_REPAIR, figures, ())[2].startswith(f"Nothing is {said}")
+
+
 def test_a_scan_without_normals_is_drawn_as_bright_as_one_with() -> None:
     """Seen from the first view, whose sides look left, front and up."""
     sides = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
