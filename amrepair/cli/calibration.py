@@ -81,6 +81,12 @@ def calibrate_command(
     with console.starting():
         from amrepair.cli import error_calibration, pose_calibration
     if sound:
+        posed = {"--scan": scan, "--job": job, "--port": port, "--scanner": scanner}
+        if given := [word for word, value in posed.items() if value is not None]:
+            raise InputError(
+                f"{' and '.join(given)} find where the scanner hangs, and --sound learns what it "
+                "leaves on sound parts; calibrate one after the other"
+            )
         error_calibration.run(
             sound, template, name, scan_unit=scan_unit, seed=seed, as_json=as_json
         )

@@ -23,6 +23,7 @@ from typer.testing import CliRunner
 
 import gcode
 from amrepair.align.standing import refuse_impossible
+from amrepair.cli.app import app
 from amrepair.cli.approval import Terminal, confirmed
 from amrepair.cli.error_calibration import why_perhaps_not_sound
 from amrepair.cli.options import part_pose
@@ -451,3 +452,11 @@ def test_brackets_are_told_as_they_are(shown: Console) -> None:
     with shown.capture() as told:
         shown.print("part[left].gcode: nothing speaks against it")
     assert told.get() == "part[left].gcode: nothing speaks against it\n"
+
+
+def test_calibrating_two_things_at_once_is_refused() -> None:
+    # regression: --scan was ignored beside --sound
+    words = ["calibrate", "--sound", "a.ply", "--scan", "b.ply", "--job", "c.gcode"]
+    found = CliRunner().invoke(app, words)
+    assert isinstance(found.exception, InputError)
+    assert str(found.exception).startswith("--scan and --job find where the scanner hangs")
