@@ -19,6 +19,8 @@ from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
+INTERRUPTED = 130  # exit code, as of a shell
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -41,6 +43,16 @@ def prepare() -> None:
     mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
     mallopt(_MMAP_THRESHOLD, _MAPPED_BYTES)
     mallopt(_ARENA_MAX, _ARENAS)
+
+
+@contextlib.contextmanager
+def interrupt_told(name: str) -> Iterator[None]:
+    """Within it, while libraries load, an interrupt is one sentence and its exit code."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        sys.stderr.write(f"{name}: interrupted\n")
+        sys.exit(INTERRUPTED)
 
 
 _THREAD_COUNTS = (

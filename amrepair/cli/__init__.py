@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from gcode.process import prepare
+from gcode.process import interrupt_told, prepare
 
 prepare()  # before numpy is loaded
 
@@ -17,12 +17,10 @@ __all__ = ["main"]
 def main() -> None:
     """Entry point; where a library is missing, it says which and how to fix it."""
     try:
-        from amrepair.cli.app import main as run
+        with interrupt_told("amrepair"):
+            from amrepair.cli.app import main as run
 
-        run()
-    except KeyboardInterrupt:  # while the libraries were loading
-        sys.stderr.write("amrepair: interrupted\n")
-        sys.exit(130)
+            run()
     except ImportError as error:
         sys.stderr.write(f"amrepair: a library that it needs cannot be loaded: {error}\n")
         _say_what_is_wrong()

@@ -14,6 +14,7 @@ from jaxtyping import Int
 
 from amrepair.arrays import Mask, Numbers, Points, Values
 from amrepair.field import scales_kernels as kernels
+from amrepair.field.groups import cell_numbers
 from amrepair.frames import cells_of, unit_vectors
 
 # Neighbours of one window face within 60° of each other: a curved surface is one, the two sides
@@ -185,6 +186,11 @@ def ways_of(normal: Points) -> Numbers:
     axis = np.abs(normal).argmax(axis=1)
     most = normal[np.arange(len(normal)), axis]
     return np.where(most == 0.0, 6, 2 * axis + (most > 0))
+
+
+def faced_places(place_mm: Points, normal: Points, cell_mm: float) -> Numbers:
+    """(c,) a number from 0 for each place of a surface: a cell, and the way that it faces."""
+    return cell_numbers(np.column_stack([cells_of(place_mm, 0.0, cell_mm), ways_of(normal)]))
 
 
 def _grouped(

@@ -11,7 +11,7 @@ they agree, points were mixed, and nothing is known of views.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Int
@@ -52,7 +52,8 @@ def views_in_order(points_mm: Points, options: OrderOptions = DEFAULT_ORDER) -> 
     """
     step = -(-len(points_mm) // options.most_points)
     some = points_mm[::step]
-    first, last, places = _pairs(some, options)
+    grids = [_cells(some, aside, options) for aside in (0.0, 0.5)]
+    first, last, places = _pairs([_key(cells) for cells in grids])
     found: list[tuple[float, Numbers]] = []
     for apart in _distances(len(some)):
         far = int(np.count_nonzero(last - first > apart))
@@ -63,13 +64,12 @@ def views_in_order(points_mm: Points, options: OrderOptions = DEFAULT_ORDER) -> 
         begins, contradicted = _runs(first, last, apart, len(some), options)
         if len(begins) > 1 and contradicted <= options.most_contradicted * far:
             found.append((contradicted / far, begins))
-    cells = _cells(some, 0.0, options)
     for _, begins in sorted(found, key=lambda one: one[0]):
         view = np.searchsorted(begins, np.arange(len(some)), side="right") - 1
         # neither rows of a single view nor blocks of one cloud
         if (
-            _wide(cells, view) >= options.least_wide
-            and _side_by_side(some, cells, view) <= options.most_beside
+            _wide(grids[0], view) >= options.least_wide
+            and _side_by_side(some, grids[0], view) <= options.most_beside
         ):
             return np.asarray(np.repeat(view, step)[: len(points_mm)], np.int64)
     return None
@@ -90,7 +90,8 @@ def _key(cells: Int[np.ndarray, "n 3"]) -> Numbers:
 def _wide(cells: Int[np.ndarray, "n 3"], view: Numbers) -> float:
     """How many cells wide the median view is: its cells over its length in cells."""
     place = _key(cells)
-    filled = np.bincount(np.unique(place + view * (place.max() + 1)) // (place.max() + 1))
+    places = int(place.max()) + 1
+    filled = np.bincount(np.unique(place + view * places) // places)
     runs = np.split(cells.astype(float), np.flatnonzero(np.diff(view)) + 1)
     return float(np.median(filled / [max(diagonal(run), 1.0) for run in runs]))
 
@@ -120,7 +121,7 @@ def _side_by_side(points_mm: Points, cells: Int[np.ndarray, "n 3"], view: Number
 
 
 def _pairs(
-    points_mm: Points, options: OrderOptions
+    grids: Sequence[Numbers],
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], int]:
     """(k,) points of one place that follow each other in the order, twice; how many places.
 
@@ -128,8 +129,7 @@ def _pairs(
     grid would end where its cells do.
     """
     first, last, places = [], [], 0
-    for aside in (0.0, 0.5):
-        place = _key(_cells(points_mm, aside, options))
+    for place in grids:
         order = np.argsort(place, kind="stable")
         same = place[order][1:] == place[order][:-1]
         first.append(order[:-1][same])

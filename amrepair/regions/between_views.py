@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Numbers, Values
 from amrepair.field import scales_kernels
-from amrepair.field.scales import Scale, ways_of
-from amrepair.frames import cells_of
+from amrepair.field.scales import Scale, faced_places
 from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.regions.inspected import Inspected
 
@@ -52,8 +51,7 @@ class Said:
         value_mm, normal = inspected.value_mm[:n], inspected.normal[:n]
         beyond_mm = value_mm - np.clip(value_mm, -half_mm, half_mm)
         place_mm = inspected.place_mm[:n] - beyond_mm[:, None] * normal
-        cell = np.column_stack([cells_of(place_mm, 0.0, inspected.cell_mm), ways_of(normal)])
-        foot = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+        foot = faced_places(place_mm, normal, inspected.cell_mm)
         views = int(shares.view.max(initial=0)) + 1
         at = foot[shares.place] * views + shares.view
         size = (int(foot.max(initial=-1)) + 1) * views

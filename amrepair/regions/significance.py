@@ -27,9 +27,8 @@ from scipy.special import comb, log_ndtr, ndtri
 
 from amrepair.arrays import Mask, Numbers, Values
 from amrepair.field import scales_kernels
-from amrepair.field.groups import cell_numbers, connected, group_points
-from amrepair.field.scales import RANK, WINDOW_FACING, Scale, scales_of, ways_of
-from amrepair.frames import cells_of
+from amrepair.field.groups import connected, group_points
+from amrepair.field.scales import RANK, WINDOW_FACING, Scale, faced_places, scales_of
 from amrepair.regions.between_views import Said, ViewErrors
 from amrepair.regions.error_calibration import Calibration
 from amrepair.regions.inspected import Inspected
@@ -402,8 +401,7 @@ def _wander(
     place_mm, normal = scale.place_mm[own], scale.normal[own]
     pick = np.arange(0, len(place_mm), max(len(place_mm) // options.most_windows, 1))
     # patches farther apart than errors are correlated: their number is that of independent places
-    cell = cells_of(place_mm, 0.0, 0.5 * options.far_mm)
-    patch_of = cell_numbers(np.column_stack([cell, ways_of(normal)]))
+    patch_of = faced_places(place_mm, normal, 0.5 * options.far_mm)
     # a defect on a third of the best seen places is in half of all pairs, so the median would see
     # it; the lower quartile does not
     off_mm, worse, touched = scales_kernels.differences_apart(

@@ -14,7 +14,7 @@ import numpy as np
 
 from amrepair.arrays import Points, Values
 from amrepair.field.groups import cell_numbers
-from amrepair.field.scales import ways_of
+from amrepair.field.scales import faced_places
 from amrepair.frames import cells_of, unit_vectors
 from amrepair.observe.as_made import as_made
 from amrepair.observe.nuisance import Nuisance, fit_nuisance
@@ -131,8 +131,7 @@ def _halves_joined(inspected: Inspected, told: Shares) -> tuple[Points, Points, 
     """
     cells = slice(inspected.cells)
     feet_mm, normal = inspected.place_mm[cells], inspected.normal[cells]
-    key = np.column_stack([cells_of(feet_mm, 0.0, inspected.cell_mm), ways_of(normal)])
-    joined = cell_numbers(key)
+    joined = faced_places(feet_mm, normal, inspected.cell_mm)
     whole = replace(told, place=joined[told.place]).gathered()
     points = np.bincount(joined, inspected.weight[cells])
 

@@ -4,9 +4,7 @@ Exit 0 done, 2 bad input or refused, 4 printer or link. `--json` prints one obje
 output; messages and progress go to standard error.
 """
 
-import sys
-
-from gcode.process import prepare
+from gcode.process import interrupt_told, prepare
 
 prepare()  # before numpy is loaded, which a command line does late
 
@@ -15,10 +13,7 @@ __all__ = ["main"]
 
 def main() -> None:
     """Entry point."""
-    try:
+    with interrupt_told("gcode"):
         from gcode.cli.app import main as run
 
         run()
-    except KeyboardInterrupt:  # while the libraries were loading
-        sys.stderr.write("gcode: interrupted\n")
-        sys.exit(130)

@@ -30,11 +30,11 @@ from rich.progress import (
 from rich.text import Text
 
 from gcode.errors import InputError
+from gcode.process import INTERRUPTED
 from gcode.profiles.names import Kind, list_profiles
 from gcode.whole import put_in_place
 
 NOT_WITHIN_TOLERANCE = 3
-INTERRUPTED = 130
 READER_GONE = 141  # as of a program that SIGPIPE ended: 128 + 13
 RATE_DIGITS = 10.0  # from here on a rate is told in whole numbers
 COUNTED = 2  # stages of fewer steps are told in per cent alone
