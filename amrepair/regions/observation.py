@@ -23,6 +23,7 @@ from amrepair.observe.order import views_of
 from amrepair.observe.rays import Passed, RangeImage, passed, range_images
 from amrepair.observe.views import Shares
 from amrepair.regions.options import RegionOptions
+from amrepair.regions.other_pieces import other_pieces
 from amrepair.regions.wall_ends import NO_ENDS, ShownSurface, WallEnds, wall_ends
 from amrepair.scans import Scan
 from amrepair.scans.range_grid import FLYING
@@ -112,6 +113,8 @@ def observed(
         f_mm = template.distance(scan.points_mm)
         surface_mm, normals = surface or template.surface_points(options.spacing_mm)
         keep = ~background(scan, template, f_mm, surface_mm, options.background)
+        low_z_mm = float(template.bounds_mm[0, 2])
+        keep &= ~other_pieces(scan.points_mm, f_mm, keep, low_z_mm, options.background)
         if scan.edge is not None:  # pixels that hang between two surfaces lie on neither
             keep &= scan.edge & FLYING == 0
         view = told.result()

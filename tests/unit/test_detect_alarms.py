@@ -100,6 +100,29 @@ def test_points_that_stray_in_the_air_are_no_surface(seed: int) -> None:
     assert (np.abs(found.box_mm.mean(axis=0)[:2] - (-7, 15)) < 1.0).all()
 
 
+def beside_it(low_mm: float) -> np.ndarray:
+    """(n, 3) another plate on the bed, 20 mm wide, whose near side lies at x = 40 + `low_mm`."""
+    shown, normals = sample_surface(box((0, 0, 0), (20, 30, 6)).body, 0.4, seed=5)
+    return shown[normals[:, 2] > -0.5] + (40.0 + low_mm, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("away_mm", [2.0, 8.0])
+def test_a_copy_beside_the_part_is_another_piece(away_mm: float) -> None:
+    # regression: of a copy 10 mm away the near side was 87 mm³ of excess, 12 mm deep, as far as
+    # excess is looked for
+    plate, bare = box((0, 0, 0), (40, 30, 6)), on_bed(0.0, seen_from_below=False)
+    two = np.concatenate([bare.points_mm, beside_it(away_mm)])
+    assert detect(Scan(two, SIGMA_MM, "template"), plate).regions == ()
+
+
+def test_what_touches_the_part_is_excess_however_far_it_goes_on() -> None:
+    plate, bare = box((0, 0, 0), (40, 30, 6)), on_bed(0.0, seen_from_below=False)
+    grown = np.concatenate([bare.points_mm, beside_it(0.0)])
+    (found,) = detect(Scan(grown, SIGMA_MM, "template"), plate).regions
+    assert found.label == Label.EXCESS
+    assert found.box_mm[1, 0] > 50.0
+
+
 def strand(noise_mm: float, high_mm: float, seed: int) -> Scan:
     """A plate of 24 × 20 × 3 mm over which a strand 0.8 mm wide and 12 mm long lies askew."""
     rng = np.random.default_rng(seed)
