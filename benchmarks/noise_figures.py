@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from amrepair.simulate.recording import SIGMA_OF_MAD
+from amrepair.observe.robust import MAD_TO_SIGMA
 
 FARTHEST_PAIR_MM = 12.0
 CLIP_SIGMAS = 3.0  # pairs are compared within: a few points far off would say all
@@ -50,7 +50,7 @@ def noise_figures(residual_mm: Float[np.ndarray, "k ny nx"], pitch_mm: float) ->
     if not len(found):
         return NoiseFigures(0.0, 0.0, np.zeros(1), np.zeros(1), 0.0)
     middle = float(np.median(found))
-    sigma = SIGMA_OF_MAD * float(np.median(np.abs(found - middle)))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(found - middle)))
     limit = CLIP_SIGMAS * max(sigma, 1e-9)
     clipped = np.clip(residual_mm.astype(np.float64) - middle, -limit, limit)
     variance = float(np.nanvar(clipped))

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from amrepair.errors import InputError
+from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.simulate.options import DEFAULT_RECORDING
 from amrepair.simulate.recording import (
     PITCH_MM,
     RECORDING_VERSION,
-    SIGMA_OF_MAD,
     Recording,
     edge_distance_mm,
 )
@@ -89,7 +89,7 @@ def view_offset_mm(normals: np.ndarray, deviation_mm: np.ndarray) -> np.ndarray:
     shift = np.zeros(3)
     for _ in range(5):
         left = deviation_mm - normals @ shift
-        spread = SIGMA_OF_MAD * float(np.median(np.abs(left[use])))
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(left[use])))
         near = use & (np.abs(left) <= CLIP_SIGMAS * max(spread, 1e-6))
         shift = np.linalg.lstsq(normals[near], deviation_mm[near], rcond=1e-3)[0]
     return np.asarray(shift)

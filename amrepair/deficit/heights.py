@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 from scipy import ndimage
 
-from amrepair.arrays import ColumnMask, HeightMap, Numbers, Points
+from amrepair.arrays import ColumnMask, HeightMap, Mask, Numbers, Points
 from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import DEFAULT_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
@@ -63,7 +63,7 @@ def as_built_heights(
     grid = HeightField(low[:2].copy(), cell_mm, np.zeros((ny, nx)), np.zeros((ny, nx), bool))
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
     solid_z = np.full(grid.shape, top_z + options.unseen_margin_mm)
-    z, seen = _tops(points, grid, options)
+    z, seen = _tops(points, grid, spacing_mm, options)
     known = seen
     cut = scan.sensors_mm is not None and _is_cut_to(box, grid, seen, options)
     if scan.sensors_mm is None or cut:
@@ -253,14 +253,23 @@ def with_what_stands_out(
     ]  # fmt: skip
     if len(out) == 0:
         return field
-    # itself is one of them
-    within_mm = options.beside_spacings * spacing_mm
-    out = out[has_near(out, points_mm, within_mm, enough=options.others_near + 1)]
+    out = out[_is_beside(out, points_mm, spacing_mm, options)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)
     np.maximum.at(z_mm, tuple(index[inside].T), out[inside, 2] - options.crest_sigma * sigma_mm)
     return field.raised(z_mm)
+
+
+def _is_beside(
+    asked_mm: Points,
+    points_mm: Float[np.ndarray, "m 3"],
+    spacing_mm: float,
+    options: HeightOptions,
+) -> Mask:
+    """(k,) whether some of the points have others beside them, as on a surface."""
+    within_mm = options.beside_spacings * spacing_mm
+    return has_near(asked_mm, points_mm, within_mm, enough=options.others_near + 1)  # itself too
 
 
 def with_others(field: HeightField, others: HeightField) -> HeightField:
@@ -347,12 +356,13 @@ def columns_of(
 
 
 def _tops(
-    points_mm: Points, grid: HeightField, options: HeightOptions
+    points_mm: Points, grid: HeightField, spacing_mm: float, options: HeightOptions
 ) -> tuple[HeightMap, ColumnMask]:
     """The mean height of each cell's topmost surface, and whether the cell has points.
 
-    A single point above the others of its cell is ignored where no neighbouring cell is as high:
-    a scanner's stray point would keep the nozzle away from everything around it.
+    A single point above the others of its cell is ignored where no neighbouring cell is as high,
+    and one that is alone in its cell where no others are near: a scanner's stray point would keep
+    the nozzle away from everything around it.
     """
     points, band_mm = read_only(points_mm), options.top_band_mm
     column = kernels.columns(points, grid.origin_mm, grid.cell_mm, *grid.shape)
@@ -361,7 +371,9 @@ def _tops(
     around_mm = ndimage.maximum_filter(
         top_mm.reshape(grid.shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
     ).ravel()
-    alone = (count == 1) & (among > 1) & (around_mm < top_mm - band_mm)
+    alone = (count == 1) & (around_mm < top_mm - band_mm)
+    single = np.flatnonzero((column >= 0) & (alone & (among == 1))[column])
+    alone[column[single[_is_beside(points_mm[single], points_mm, spacing_mm, options)]]] = False
     if alone.any():
         below_mm = np.where(alone, top_mm, np.inf)
         _, mean_mm, count, _ = kernels.topmost(column, points, below_mm, band_mm)

@@ -15,6 +15,7 @@ from jaxtyping import Int
 from amrepair.arrays import Vector
 from amrepair.eigen_kernels import least_axis
 from amrepair.field.scales_kernels import median
+from amrepair.observe.robust import MAD_TO_SIGMA
 from gcode.compiled import njit, prange
 
 # Most points that one fit looks at; denser clouds are thinned before.
@@ -323,7 +324,7 @@ def _overruled(value, noise, rules, banned):
     middle = median(said, who)
     for s in range(who):
         said[s] = abs(said[s] - middle)
-    scale = 1.4826 * median(said, who)
+    scale = MAD_TO_SIGMA * median(said, who)
     kept, mean, variance = 0, 0.0, 0.0
     for s in range(scans):
         bound = max(rules.outlier_sigmas * max(scale, noise[s]), rules.outlier_mm)

@@ -21,10 +21,10 @@ from scipy import ndimage
 
 from amrepair.arrays import PlanePoints, Values
 from amrepair.errors import InputError
+from amrepair.observe.robust import sigma_by_median
 from amrepair.simulate.options import DEFAULT_RECORDING
 
 RECORDING_VERSION = 1
-SIGMA_OF_MAD = 1.4826  # normal distribution
 LARGEST_BYTES = 2**30  # of an array: 200 views of a megapixel
 PITCH_MM = (0.02, 5.0)  # as a scanner's spacing_mm
 _KEYS = ("version", "pitch_mm", "residual_mm", "cosine", "edge_mm", "offset_mm", "source")
@@ -59,7 +59,7 @@ class Recording:
     def sigma_mm(self) -> float:
         """Robust standard deviation of all residuals."""
         found = self.residual_mm[np.isfinite(self.residual_mm)]
-        return SIGMA_OF_MAD * float(np.median(np.abs(found - np.median(found))))
+        return sigma_by_median(found)
 
 
 def edge_distance_mm(plane_mm: PlanePoints, depth_mm: Values, cell_mm: float) -> Values:

@@ -146,6 +146,18 @@ def test_a_stray_point_is_no_pole_and_a_pole_is_one() -> None:
     assert heights(field, (9.9, 10.5), (4.9, 5.5)).max() > 4.5
 
 
+def test_a_stray_point_beside_the_part_is_no_pole_either() -> None:
+    # regression: no other point lay in its column, the bed being in no scan of the part alone; of a
+    # gear's corner 0.51 was out of the head's reach, and 0.78 of what was in reach got filled
+    strays = [[19.0, 5.0, 6.5], [-2.0, 8.0, 7.0]]
+    pole = [[17.5 + dx, 8.0 + dy, 4.8] for dx in (0, 0.2, 0.4) for dy in (0, 0.2, 0.4)]
+    part, gone = box(0, 0, 0, 16, 10, 4), box(13, -1, 2, 17, 11, 5)
+    field = field_of(part, gone, np.array(strays + pole))
+    assert heights(field, (18.0, 20.0), (4.0, 6.0)).max() < 0.1
+    assert heights(field, (-3.0, -1.0), (7.0, 9.0)).max() < 0.1
+    assert heights(field, (17.4, 18.0), (7.9, 8.5)).max() > 4.5
+
+
 @pytest.mark.slow
 def test_what_is_thinner_than_the_scan_is_fine_stands_as_high_as_it_was_seen() -> None:
     """Cells took the mean of a crest and what lies beside it: the tip went 0.21 mm into one."""
