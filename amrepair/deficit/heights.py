@@ -31,7 +31,6 @@ from gcode.compiled import read_only
 from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
-AROUND_CELL = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
 # Directions to the columns around a point; its own comes first, and suffices for most points.
 OWN_COLUMN_FIRST = sorted(itertools.product((-1.0, 0.0, 1.0), repeat=2), key=np.linalg.norm)
 
@@ -360,24 +359,42 @@ def _tops(
 ) -> tuple[HeightMap, ColumnMask]:
     """The mean height of each cell's topmost surface, and whether the cell has points.
 
-    A single point above the others of its cell is ignored where no neighbouring cell is as high,
-    and one that is alone in its cell where no others are near: a scanner's stray point would keep
-    the nozzle away from everything around it.
+    A scanner's stray points would keep the nozzle away from everything around them. So a single
+    point above the others of its cell is ignored where no neighbouring cell is as high, and a few
+    that stand out of most of those around where no others are near.
     """
     points, band_mm = read_only(points_mm), options.top_band_mm
     column = kernels.columns(points, grid.origin_mm, grid.cell_mm, *grid.shape)
-    every = np.full(grid.z_mm.size, np.inf)
-    top_mm, mean_mm, count, among = kernels.topmost(column, points, every, band_mm)
-    around_mm = ndimage.maximum_filter(
-        top_mm.reshape(grid.shape), footprint=AROUND_CELL, mode="constant", cval=-np.inf
-    ).ravel()
-    alone = (count == 1) & (around_mm < top_mm - band_mm)
-    single = np.flatnonzero((column >= 0) & (alone & (among == 1))[column])
-    alone[column[single[_is_beside(points_mm[single], points_mm, spacing_mm, options)]]] = False
-    if alone.any():
-        below_mm = np.where(alone, top_mm, np.inf)
-        _, mean_mm, count, _ = kernels.topmost(column, points, below_mm, band_mm)
-    return mean_mm.reshape(grid.shape), count.reshape(grid.shape) > 0
+    below_mm = np.full(grid.z_mm.size, np.inf)
+    first = True
+    while True:
+        top_mm, mean_mm, count, among = kernels.topmost(column, points, below_mm, band_mm)
+        as_high = _neighbours_as_high(top_mm.reshape(grid.shape), band_mm).ravel()
+        alone = (count == 1) & (among > 1) & (as_high == 0) & first
+        asked = (count > 0) & (count <= options.others_near) & (as_high < 4) & ~alone
+        which = np.flatnonzero((column >= 0) & asked[column])
+        own = column[which]
+        inside = (points[which, 2] >= top_mm[own] - band_mm) & (points[which, 2] < below_mm[own])
+        which = which[inside]
+        asked[column[which[_is_beside(points[which], points, spacing_mm, options)]]] = False
+        strays = alone | asked
+        if not strays.any():
+            return mean_mm.reshape(grid.shape), count.reshape(grid.shape) > 0
+        below_mm[strays] = np.where(count == 1, top_mm, top_mm - band_mm)[strays]
+        first = False
+
+
+def _neighbours_as_high(top_mm: HeightMap, band_mm: float) -> Int[np.ndarray, "ny nx"]:
+    """How many of the eight cells around each one are as high, but for a band."""
+    around = np.pad(top_mm, 1, constant_values=-np.inf)
+    ny, nx = top_mm.shape
+    return np.asarray(
+        sum(
+            (around[i : i + ny, j : j + nx] >= top_mm - band_mm).astype(np.int64)
+            for i, j in itertools.product(range(3), repeat=2)
+            if (i, j) != (1, 1)
+        )
+    )
 
 
 def _close_gaps(
