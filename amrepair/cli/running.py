@@ -103,7 +103,7 @@ def run(
     if resume is not None:
         if job_file is not None:
             raise InputError("--resume takes the job from the run's folder; leave JOB out")
-        begun = gone_on_with(resume, port, scanner, approve)
+        begun = gone_on_with(resume, port, scanner, approve, bars)
     else:
         begun = new_run(
             _given(job_file, "JOB"),
@@ -274,9 +274,17 @@ def _how_it_stands(found: Sequence[Located], names: Sequence[str], *, in_turn: b
     return f"{every}; all of them are looked at."
 
 
-def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: str | None) -> Begun:
+def gone_on_with(
+    folder: Path,
+    port: str | None,
+    scanner: str | None,
+    approve: str | None,
+    bars: console.Bars,
+) -> Begun:
     """Open a run's folder; what is said now counts more than what was said then."""
-    run = open_run(folder)
+    with bars.shown(), bars.stage("check"):
+        run = open_run(folder)
+        checked = run.judged()
     changes: dict[str, Any] = {"port": port, "scanner": scanner, "approve": approve}
     setting = replace(run.setting, **{k: v for k, v in changes.items() if v is not None})
     if not setting.port:
@@ -284,7 +292,7 @@ def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: s
     tape = Tape(folder)
     tape.reopen()
     return Begun(
-        setting, run.setup, run.job, run.template, run.stops, RunFolder(folder), run.judged(), tape
+        setting, run.setup, run.job, run.template, run.stops, RunFolder(folder), checked, tape
     )
 
 
@@ -337,7 +345,7 @@ def print_run(
     )  # fmt: skip
     page.show_run(begun.job, setting.placed.solid(begun.template.solid()))
     if not going_on:
-        with bars.stage("connect"):
+        with bars.shown(), bars.stage("connect"):
             machine.connect()
     page.drives(machine.pause, machine.resume)
     expected = sites(

@@ -204,7 +204,9 @@ class _Service:
         if events and events[-1].get("event") == "end":
             return None
         if events:
-            begun = gone_on_with(folder, None, told.said["scanner"], told.said["approve"])
+            begun = gone_on_with(
+                folder, None, told.said["scanner"], told.said["approve"], AtDesk(self._talk)
+            )
         else:
             kept = folder / Path(job.name).name
             write_bytes(kept, data)
