@@ -120,10 +120,7 @@ def run(
             **said,
         )
     ask = begun.setting.approve == "ask"
-    with (
-        console.signals_end_it(),
-        live_view(shown, ask=ask, title=begun.setting.title) as page,
-    ):
+    with live_view(shown, ask=ask, title=begun.setting.title) as page:
         report, warmth = _printed(
             begun,
             page,

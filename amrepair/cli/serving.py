@@ -76,13 +76,12 @@ def serve(told: Served) -> int:
     machine.connect()
     talk = Talk(machine, screens, console.errors.print)
     try:
-        with console.signals_end_it():
-            machine.require_partner()
-            if touches and isinstance(machine, TellsTouches):
-                machine.require_touches()
-            talk.listen()
-            talk.say("the agent is here.")
-            return _Service(told, machine, talk).run()
+        machine.require_partner()
+        if touches and isinstance(machine, TellsTouches):
+            machine.require_touches()
+        talk.listen()
+        talk.say("the agent is here.")
+        return _Service(told, machine, talk).run()
     except KeyboardInterrupt:
         console.errors.print(
             "A print that rests at a look stays so, heaters off; one that goes on goes on. "

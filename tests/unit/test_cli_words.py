@@ -254,21 +254,25 @@ def test_an_interrupt_that_a_library_swallows_is_told_as_one(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_while_libraries_load_is_one_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: signal.Signals
 ) -> None:
-    """regression: `gcode` ended in a traceback."""
+    """regression: `gcode` ended in a traceback, and where it was told to end without a word."""
+    usual = signal.default_int_handler if number is signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)
 
     class Pressed:
         def find_spec(self, name: str, *_: object) -> None:
             if name == "gcode.cli.app":
-                raise KeyboardInterrupt
+                signal.raise_signal(number)
 
     monkeypatch.delitem(sys.modules, "gcode.cli.app")
     monkeypatch.delattr(gcode.cli, "app", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Pressed(), *sys.meta_path])
     with pytest.raises(SystemExit) as end:
         gcode.cli.main()
+    signal.signal(number, before)
     assert end.value.code == 130
     assert capsys.readouterr().err == "gcode: interrupted\n"
 

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from amrepair.cli import running
 from amrepair.cli.app import app
-from amrepair.cli.live import NoView, ViewPlace
+from amrepair.cli.live import NoView
+from amrepair.errors import AmrepairError
 from amrepair.repair import Stopwatch
 from gcode.cli import console
 
@@ -27,7 +28,7 @@ def number(request: pytest.FixtureRequest) -> Iterator[signal.Signals]:
 
 
 def test_a_loop_that_is_told_to_end_takes_its_safe_exits(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """regression: it was killed on the spot, without a word, where no fleet supervised it."""
 
@@ -38,21 +39,11 @@ def test_a_loop_that_is_told_to_end_takes_its_safe_exits(
     setting = SimpleNamespace(approve="auto", title="a job")
     monkeypatch.setattr(running, "gone_on_with", lambda *_: SimpleNamespace(setting=setting))
     monkeypatch.setattr(running, "_printed", printed)
-    said: dict[str, Any] = dict.fromkeys(("port", "scanner", "approve"))
-    with pytest.raises(KeyboardInterrupt):
-        running.run(
-            None,
-            None,
-            Path(),
-            (None, None, "repair_0.20"),
-            running.Looks(),
-            None,
-            ViewPlace(False, "127.0.0.1", 0, None),
-            resume=Path("run"),
-            pose_confirmed=False,
-            as_json=False,
-            **said,
-        )
+    monkeypatch.setattr("sys.argv", ["amrepair", "loop", "--resume", "run"])
+    with pytest.raises(SystemExit) as end:
+        console.run(app, "amrepair", (AmrepairError,))
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "amrepair: interrupted\n"
     assert signal.getsignal(number) is signal.SIG_DFL
 
 
