@@ -62,6 +62,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 _circles_left: list[bool] = []
+_older: dict[Path, tuple[int, int]] = {}  # outputs of the command that are there from before
 
 
 class _TimeLeft(TimeRemainingColumn):
@@ -235,8 +236,28 @@ def writable(path: Path) -> None:
     elif not os.access(folder, os.W_OK):
         why = f"no permission to write in {folder.resolve()}; choose another folder"
     else:
+        if path.is_file():
+            _older.setdefault(path, _mark(path))
         return
     raise InputError(f"{path} cannot be written: {why}.")
+
+
+def _mark(path: Path) -> tuple[int, int]:
+    """What differs once a file was written anew, or is gone."""
+    try:
+        now = path.stat()
+    except OSError:
+        return 0, 0
+    return now.st_ino, now.st_mtime_ns
+
+
+def _left_as_they_were() -> str:
+    """What is to be told of outputs that are there from before, and may be taken for this one's."""
+    left = [str(path) for path, mark in _older.items() if _mark(path) == mark]
+    if not left:
+        return ""
+    ones = "is an older one" if len(left) == 1 else "are older ones"
+    return f"{' and '.join(left)} {ones}, left as before"
 
 
 def write_text(path: Path, text: str) -> None:
@@ -303,6 +324,7 @@ def leave_circles() -> None:
 
 def _exit_code(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> int:
     _json_shown.clear()
+    _older.clear()
     piped = _is_pipe()
     try:
         code = _ended(app, name, known)
@@ -338,6 +360,8 @@ def _ended(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> i
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word
         return _failed(f"{name}: interrupted", code)
+    if left := _left_as_they_were():
+        errors.print(f"{left}.")
     return code if isinstance(code, int) else 0
 
 
@@ -355,6 +379,8 @@ def _misused(error: Exception) -> int:
 
 def _failed(sentence: str, code: int, style: str | None = None) -> int:
     """Tell of a failure once for people and, where it was asked for, once for programs."""
+    if left := _left_as_they_were():
+        sentence = f"{sentence.rstrip('.')}; {left}."
     errors.print(sentence, style=style)
     if "--json" in sys.argv[1:] and not _json_shown:
         show_json({"error": sentence, "exit_code": code})

@@ -225,6 +225,36 @@ def test_every_end_has_its_code_and_one_sentence(
     assert len(told.splitlines()) == bool(said)
 
 
+@pytest.mark.parametrize("how", ["fails", "ends", "writes"])
+def test_an_output_of_before_is_told_from_this_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str
+) -> None:
+    """regression: a program that was refused left an older one of its name, and none told so."""
+    path = tmp_path / "rest.gcode"
+    path.write_text("G28\n")
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.command()
+    def go() -> None:
+        console.writable(path)
+        if how == "writes":
+            console.write_text(path, "G28\n")
+        if how == "fails":
+            raise InputError("there is no such layer.")
+
+    monkeypatch.setattr("sys.argv", ["amrepair"])
+    with pytest.raises(SystemExit):
+        console.run(app, "amrepair", (AmrepairError,))
+    assert (
+        capsys.readouterr().err
+        == {
+            "fails": f"amrepair: there is no such layer; {path} is an older one, left as before.\n",
+            "ends": f"{path} is an older one, left as before.\n",
+            "writes": "",
+        }[how]
+    )
+
+
 def test_an_interrupt_that_a_library_swallows_is_told_as_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

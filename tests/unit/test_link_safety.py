@@ -260,7 +260,7 @@ def test_a_file_that_is_no_journal_is_bad_input(tmp_path: Path) -> None:
     other = tmp_path / "part.stl"
     other.write_text("solid part\n" * 200)
     for path in (other, tmp_path, other / "journal"):
-        with pytest.raises(JournalFileError, match="cannot be used .*; name another file") as told:
+        with pytest.raises(JournalFileError, match=r"cannot be used .*; name another file") as told:
             Journal(path)
         assert told.value.exit_code == 2
 
