@@ -22,7 +22,8 @@ from types import FrameType
 from typing import ParamSpec, TypeVar
 
 INTERRUPTED = 130  # exit code, as of a shell
-_ENDS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last of them is none of Windows'
+_END_SIGNALS = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 _heard: list[list[int]] = []  # what came, within each `signals_end_it` that is open
 
 P = ParamSpec("P")
@@ -56,7 +57,7 @@ def signals_end_it() -> Iterator[None]:
     One that is ignored (`nohup`), or that somebody else listens to, stays so.
     """
     usual = (signal.SIG_DFL, signal.default_int_handler)
-    before = {number: signal.getsignal(number) for number in _ENDS}
+    before = {number: signal.getsignal(number) for number in _END_SIGNALS}
     taken = {number: was for number, was in before.items() if was in usual}
     for number in taken:
         signal.signal(number, _end)
@@ -76,7 +77,7 @@ def interrupted() -> bool:
 
 def usual_signals() -> None:
     """In a forked worker: the parent alone hears of Ctrl+C; what ends a worker does so at once."""
-    for number in _ENDS:
+    for number in _END_SIGNALS:
         if signal.getsignal(number) is _end:
             signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
