@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -165,7 +166,7 @@ def _printed(
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
-            f"amrepair loop --resume {begun.folder.path}"
+            f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
         )
         raise
     finally:
@@ -201,8 +202,8 @@ def new_run(
     before = read_events(out)
     if before and before[-1].get("event") != "end":
         raise InputError(
-            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume {out}') "
-            "or name another folder with --out"
+            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume "
+            f"{shlex.quote(str(out))}') or name another folder with --out"
         )
     job = job_for(text, setup.printer)
     require_one_frame(job)

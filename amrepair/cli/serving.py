@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,7 @@ def serve(told: Served) -> int:
     except KeyboardInterrupt:
         console.errors.print(
             "A print that rests at a look stays so, heaters off; one that goes on goes on. "
-            f"Started again with --out {told.out}, the agent goes on with it."
+            f"Started again with --out {shlex.quote(str(told.out))}, the agent goes on with it."
         )
         raise
     finally:
