@@ -55,9 +55,10 @@ class _Told(Console):
         raise ReaderGoneError
 
 
-# What is told holds names of files and words of firmwares: brackets in it are no markup.
-errors = _Told(stderr=True, highlight=False, soft_wrap=True, markup=False)
-out = _Told(highlight=False, soft_wrap=True, markup=False)
+# What is told holds names of files and words of firmwares: brackets in it are no markup, and a word
+# between colons is no picture.
+errors = _Told(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+out = _Told(highlight=False, soft_wrap=True, markup=False, emoji=False)
 Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
@@ -91,7 +92,7 @@ class Bars:
     def __init__(self) -> None:
         self._tasks: dict[str, TaskID] = {}
         self._bars = Progress(
-            TextColumn("{task.description:<24}"),
+            TextColumn("{task.description:<24}", markup=False),
             BarColumn(),
             TextColumn("{task.fields[share]:>5}"),
             TextColumn("{task.fields[count]}"),

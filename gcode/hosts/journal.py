@@ -152,8 +152,10 @@ class Journal:
             self._prepare()
         except (sqlite3.Error, OSError) as error:
             in_use = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_BUSY
+            why = getattr(error, "strerror", None) or error
             raise (JournalError if in_use else JournalFileError)(
-                f"The journal {path} cannot be used ({error}); name another file."
+                f"The journal {path} cannot be used ({why}); name another file with --journal, or "
+                f"another folder by XDG_STATE_HOME."
             ) from error
         self._disk: ThreadPoolExecutor | None = None
         self._extension: Future[None] | None = None

@@ -207,6 +207,8 @@ def ended(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> int:
     [
         (KeyboardInterrupt(), 130, "amrepair: interrupted"),
         (InputError("no such thing"), 2, "amrepair: no such thing"),
+        # regression: a word between colons was told as a picture
+        (InputError("--scanner watch:x: [x] is not there"), 2, "watch:x: [x] is not there"),
         (OSError(errno.ENOSPC, "No space left on device"), 2, "No space left on device; free"),
         (PermissionError(errno.EACCES, "Permission denied", "a.npz"), 2, "a.npz: Permission den"),
         (typer.Exit(3), 3, ""),
