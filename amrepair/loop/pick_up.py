@@ -21,7 +21,7 @@ from gcode.hosts.journal import Journal
 from gcode.hosts.port import PrintableProgram, Printer, PrintReport
 from gcode.hosts.resume import back_to_start, resume
 from gcode.hosts.serial import SerialPrinter
-from gcode.progress import Progress
+from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
     from gcode.hosts.served_job import ServedJob
@@ -132,6 +132,7 @@ def _by_journal(
                 before=before,
             )  # fmt: skip
             return None
+        under_way = k == len(sent) - 1 and not one.done  # else there is nothing left of it to tell
         report = resume(
             serial,
             one.checked,
@@ -139,9 +140,9 @@ def _by_journal(
             pose_confirmed=pose_confirmed,
             end=one.end,
             before=before,
-            progress=_of_all(progress, one.end - one.first),
+            progress=_of_all(progress, one.end - one.first) if under_way else silent,
         )
-        return report if k == len(sent) - 1 and not one.done else None
+        return report if under_way else None
     if latest is None and len(sent) == 1:
         serial.connect()  # killed before the first line
         return None
