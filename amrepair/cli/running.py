@@ -14,7 +14,7 @@ from amrepair.cli.live import NoView, ShownRun, ViewPlace, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
 from amrepair.cli.telling import Begun, tell, written
 from amrepair.cli.thermal_log import ThermalLog
-from amrepair.errors import InputError
+from amrepair.errors import InputError, ScannerError
 from amrepair.fleet.desk import Desk
 from amrepair.fleet.shared import SharedDetection
 from amrepair.library import template_files
@@ -50,10 +50,10 @@ from gcode.cli import console
 from gcode.cli.judging import tell_waits, tell_warnings
 from gcode.cli.options import program_text
 from gcode.cli.owning import job_setup, told_if_for_another
-from gcode.errors import JournalError
+from gcode.errors import JournalError, LinkError, PortBusyError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
-from gcode.hosts.port import Printer
+from gcode.hosts.port import Printer, ResumeRefusedError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 from gcode.reader import job_for
 from gcode.resumption.settings import require_one_frame
@@ -61,6 +61,9 @@ from gcode.resumption.settings import require_one_frame
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 PROFILES = "profiles"  # in the run's folder: those of the job's own settings
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
+
+
+WATCH = "watch:"
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +124,11 @@ def run(
             **said,
         )
     ask = begun.setting.approve == "ask"
+    if begun.setting.scanner.startswith(WATCH):
+        console.errors.print(
+            f"At each look a scan is awaited in {begun.setting.scanner.removeprefix(WATCH)}, for "
+            f"{begun.setting.scan_timeout_s:g} s."
+        )
     with live_view(shown, ask=ask, title=begun.setting.title) as page:
         report, warmth = _printed(
             begun,
@@ -168,6 +176,14 @@ def _printed(
             "The heaters were told to switch off. When somebody has looked, go on with: "
             f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
         )
+        raise
+    except (ScannerError, LinkError) as error:
+        begun_to_print = read_events(begun.folder.path)  # else the same command begins it
+        if begun_to_print and not isinstance(error, (ResumeRefusedError, PortBusyError)):
+            console.errors.print(
+                "When that is mended, go on with: "
+                f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
+            )
         raise
     finally:
         machine.close()

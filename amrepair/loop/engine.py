@@ -285,6 +285,7 @@ class Run:
             if outcome == "pass by":
                 self._silent += 1
                 self._passed.append(stop)
+                self._progress(f"no look at {stop.label}", 1.0, 1.0)
                 return None
         self._stopped = f"stop: twice the scan did not fit the part: {why}"
         return None

@@ -166,7 +166,12 @@ def silent(n: int) -> Scan:
 
 
 def test_a_silent_scanner_does_not_cost_the_print(small: Small, tmp_path: Path) -> None:
-    report, sent = small.run(tmp_path, silent, silent_stops=1, tape=Tape(tmp_path))
+    told: list[str] = []
+    report, sent = small.run(
+        tmp_path, silent, silent_stops=1, tape=Tape(tmp_path),
+        progress=lambda stage, *_: told.append(stage),
+    )  # fmt: skip
+    assert told.count(f"no look at layer-{LAYER:03d}") == 1  # regression: it was passed in silence
     assert [stop.label for stop in report.passed] == [f"layer-{LAYER:03d}"]
     assert not report.looks
     assert not report.within_tolerance
