@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 from gcode.errors import WorkerError
-from gcode.process import end_with_parent
+from gcode.process import end_with_parent, usual_signals
 
 R = TypeVar("R")
 PIECES = 12  # a worker: few enough that each is worth its way, enough that none waits long for one
@@ -87,10 +86,10 @@ def in_order(
 
 
 def _begin(told: list[Callable[[int], Any]]) -> None:
-    """In a worker: what it will be asked; the parent alone hears of Ctrl-C."""
+    """In a worker: what it will be asked."""
     global _asked  # noqa: PLW0603 - one process, one task
     _asked = told[0]
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    usual_signals()
     end_with_parent()
 
 

@@ -77,3 +77,9 @@ class PortBusyError(LinkError):
 
 class JournalError(LinkError):
     """The journal of a job cannot be read, or contradicts the printer."""
+
+
+class JournalFileError(JournalError):
+    """What was named is no journal, or cannot be made one: bad input, no fault of the link."""
+
+    exit_code = InputError.exit_code

@@ -14,12 +14,17 @@ import contextlib
 import ctypes
 import gc
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from functools import wraps
+from types import FrameType
 from typing import ParamSpec, TypeVar
 
 INTERRUPTED = 130  # exit code, as of a shell
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last of them is none of Windows'
+_END_SIGNALS = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+_heard: list[list[int]] = []  # what came, within each `signals_end_it` that is open
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -46,10 +51,50 @@ def prepare() -> None:
 
 
 @contextlib.contextmanager
+def signals_end_it() -> Iterator[None]:
+    """Let Ctrl+C, SIGTERM and SIGHUP end what is under way as one interrupt, by its safe exits.
+
+    One that is ignored (`nohup`), or that somebody else listens to, stays so.
+    """
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    before = {number: signal.getsignal(number) for number in _END_SIGNALS}
+    taken = {number: was for number, was in before.items() if was in usual}
+    for number in taken:
+        signal.signal(number, _end)
+    _heard.append([])
+    try:
+        yield
+    finally:
+        _heard.pop()
+        for number, was in taken.items():
+            signal.signal(number, was)
+
+
+def interrupted() -> bool:
+    """Whether one of them has come: what it comes to is not always told as an interrupt."""
+    return any(_heard[-1:])
+
+
+def usual_signals() -> None:
+    """In a forked worker: the parent alone hears of Ctrl+C; what ends a worker does so at once."""
+    for number in _END_SIGNALS:
+        if signal.getsignal(number) is _end:
+            signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _end(number: int, _frame: FrameType | None) -> None:
+    for heard in _heard[-1:]:
+        heard.append(number)
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
 def interrupt_told(name: str) -> Iterator[None]:
     """Within it, while libraries load, an interrupt is one sentence and its exit code."""
     try:
-        yield
+        with signals_end_it():
+            yield
     except KeyboardInterrupt:
         sys.stderr.write(f"{name}: interrupted\n")
         sys.exit(INTERRUPTED)

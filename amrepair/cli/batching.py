@@ -90,7 +90,7 @@ def _run(
     options, calibration = judging(seed=seed, sensors_mm=_places(sensor_at), scan_unit=scan_unit)
     bars = console.Bars()
     try:
-        with console.signals_end_it(), bars.shown():
+        with bars.shown():
             report = run_batch(
                 source,
                 options=options,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -65,7 +66,7 @@ def run(
     plural = "scan" if len(sound) == 1 else "scans"
     console.out.print(
         f"{kept}: from {len(sound)} sound {plural}; local means wander by {widths} where they are "
-        f"well seen. Use it with --calibration {name}."
+        f"well seen. Use it with --calibration {shlex.quote(name)}."
     )
 
 

@@ -45,7 +45,7 @@ def fleet(
 
     config = read_config(file)
     crew = Fleet(config)
-    with crew.alone(), console.signals_end_it():
+    with crew.alone():
         history = History(config.options.out / "history.sqlite")
         page = Page(crew, history, host=view_host, port=view_port, token=token)
         console.errors.print(f"Open {page.url} (Ctrl+C ends all runs safely)")

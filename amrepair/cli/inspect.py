@@ -78,6 +78,8 @@ def align(
     """Find where a scan lies in its template."""
     if output is not None and output.suffix.lower() != ".ply":
         raise InputError(f"{output}: an aligned scan is written as .ply; rename it")
+    if output is not None:
+        console.writable(output)
     if pam and method != "paper":
         raise InputError(f"--pam belongs to --method paper, the method is {method}")
     _refuse_known_of_many(part_is_known, template)

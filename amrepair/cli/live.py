@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -126,13 +125,8 @@ def _refuse(path: Path) -> None:
 
 def _until_interrupted() -> None:
     """Wait for Ctrl+C or a polite kill."""
-    over = threading.Event()
-    with contextlib.suppress(ValueError):  # not the main thread
-        signal.signal(signal.SIGTERM, lambda *_: over.set())
-    try:
-        over.wait()
-    except KeyboardInterrupt:
-        return
+    with contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
 
 
 @dataclass(frozen=True, slots=True)

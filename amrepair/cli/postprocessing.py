@@ -69,8 +69,9 @@ def postprocess(
 
     Name it in the slicer's post-processing scripts. All that was in the job stays as it is.
     """
-    from amrepair.postprocess import TARGETS, LooksAsked, mark, target_of
-    from amrepair.postprocess.mark import decoded
+    with console.starting():
+        from amrepair.postprocess import TARGETS, LooksAsked, mark, target_of
+        from amrepair.postprocess.mark import decoded
 
     if target is not None and target not in TARGETS:
         raise InputError(f"--for is {target!r}; it is one of {', '.join(TARGETS)}")
@@ -83,9 +84,13 @@ def postprocess(
     text = decoded(data, str(file))
     reader = target if target is not None else target_of(text, file.name, os.environ)
     asked = LooksAsked(every, tuple(at_z or ()), adaptive, covers_mm2, final, command)
-    marked = mark(text, file.name, reader, asked)
-    if marked.places:
-        _replace(file, marked.text.encode("utf-8", "surrogateescape"))
+    bars = console.Bars()
+    with bars.shown():
+        with bars.stage("mark"):
+            marked = mark(text, file.name, reader, asked)
+        if marked.places:
+            with bars.stage("write"):
+                _replace(file, marked.text.encode("utf-8", "surrogateescape"))
     if as_json:
         console.show_json(
             {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from amrepair.cli.live import NoView, ShownRun, ViewPlace, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
 from amrepair.cli.telling import Begun, tell, written
 from amrepair.cli.thermal_log import ThermalLog
-from amrepair.errors import InputError
+from amrepair.errors import InputError, ScannerError
 from amrepair.fleet.desk import Desk
 from amrepair.fleet.shared import SharedDetection
 from amrepair.library import template_files
@@ -49,10 +50,10 @@ from gcode.cli import console
 from gcode.cli.judging import tell_waits, tell_warnings
 from gcode.cli.options import program_text
 from gcode.cli.owning import job_setup, told_if_for_another
-from gcode.errors import JournalError
+from gcode.errors import JournalError, LinkError, PortBusyError
 from gcode.hosts import connect
 from gcode.hosts.journal import Journal, default_path
-from gcode.hosts.port import Printer
+from gcode.hosts.port import Printer, ResumeRefusedError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER
 from gcode.reader import job_for
 from gcode.resumption.settings import require_one_frame
@@ -60,6 +61,9 @@ from gcode.resumption.settings import require_one_frame
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 PROFILES = "profiles"  # in the run's folder: those of the job's own settings
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
+
+
+WATCH = "watch:"
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +107,7 @@ def run(
     if resume is not None:
         if job_file is not None:
             raise InputError("--resume takes the job from the run's folder; leave JOB out")
-        begun = gone_on_with(resume, port, scanner, approve)
+        begun = gone_on_with(resume, port, scanner, approve, bars)
     else:
         begun = new_run(
             _given(job_file, "JOB"),
@@ -120,10 +124,12 @@ def run(
             **said,
         )
     ask = begun.setting.approve == "ask"
-    with (
-        console.signals_end_it(),
-        live_view(shown, ask=ask, title=begun.setting.title) as page,
-    ):
+    if begun.setting.scanner.startswith(WATCH):
+        console.errors.print(
+            f"At each look a scan is awaited in {begun.setting.scanner.removeprefix(WATCH)}, for "
+            f"{begun.setting.scan_timeout_s:g} s."
+        )
+    with live_view(shown, ask=ask, title=begun.setting.title) as page:
         report, warmth = _printed(
             begun,
             page,
@@ -168,8 +174,16 @@ def _printed(
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
-            f"amrepair loop --resume {begun.folder.path}"
+            f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
         )
+        raise
+    except (ScannerError, LinkError) as error:
+        begun_to_print = read_events(begun.folder.path)  # else the same command begins it
+        if begun_to_print and not isinstance(error, (ResumeRefusedError, PortBusyError)):
+            console.errors.print(
+                "When that is mended, go on with: "
+                f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
+            )
         raise
     finally:
         machine.close()
@@ -204,8 +218,8 @@ def new_run(
     before = read_events(out)
     if before and before[-1].get("event") != "end":
         raise InputError(
-            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume {out}') "
-            "or name another folder with --out"
+            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume "
+            f"{shlex.quote(str(out))}') or name another folder with --out"
         )
     job = job_for(text, setup.printer)
     require_one_frame(job)
@@ -274,9 +288,17 @@ def _how_it_stands(found: Sequence[Located], names: Sequence[str], *, in_turn: b
     return f"{every}; all of them are looked at."
 
 
-def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: str | None) -> Begun:
+def gone_on_with(
+    folder: Path,
+    port: str | None,
+    scanner: str | None,
+    approve: str | None,
+    bars: console.Bars,
+) -> Begun:
     """Open a run's folder; what is said now counts more than what was said then."""
-    run = open_run(folder)
+    with bars.shown(), bars.stage("check"):
+        run = open_run(folder)
+        checked = run.judged()
     changes: dict[str, Any] = {"port": port, "scanner": scanner, "approve": approve}
     setting = replace(run.setting, **{k: v for k, v in changes.items() if v is not None})
     if not setting.port:
@@ -284,7 +306,7 @@ def gone_on_with(folder: Path, port: str | None, scanner: str | None, approve: s
     tape = Tape(folder)
     tape.reopen()
     return Begun(
-        setting, run.setup, run.job, run.template, run.stops, RunFolder(folder), run.judged(), tape
+        setting, run.setup, run.job, run.template, run.stops, RunFolder(folder), checked, tape
     )
 
 
@@ -337,7 +359,7 @@ def print_run(
     )  # fmt: skip
     page.show_run(begun.job, setting.placed.solid(begun.template.solid()))
     if not going_on:
-        with bars.stage("connect"):
+        with bars.shown(), bars.stage("connect"):
             machine.connect()
     page.drives(machine.pause, machine.resume)
     expected = sites(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,17 +77,16 @@ def serve(told: Served) -> int:
     machine.connect()
     talk = Talk(machine, screens, console.errors.print)
     try:
-        with console.signals_end_it():
-            machine.require_partner()
-            if touches and isinstance(machine, TellsTouches):
-                machine.require_touches()
-            talk.listen()
-            talk.say("the agent is here.")
-            return _Service(told, machine, talk).run()
+        machine.require_partner()
+        if touches and isinstance(machine, TellsTouches):
+            machine.require_touches()
+        talk.listen()
+        talk.say("the agent is here.")
+        return _Service(told, machine, talk).run()
     except KeyboardInterrupt:
         console.errors.print(
             "A print that rests at a look stays so, heaters off; one that goes on goes on. "
-            f"Started again with --out {told.out}, the agent goes on with it."
+            f"Started again with --out {shlex.quote(str(told.out))}, the agent goes on with it."
         )
         raise
     finally:
@@ -204,7 +204,9 @@ class _Service:
         if events and events[-1].get("event") == "end":
             return None
         if events:
-            begun = gone_on_with(folder, None, told.said["scanner"], told.said["approve"])
+            begun = gone_on_with(
+                folder, None, told.said["scanner"], told.said["approve"], AtDesk(self._talk)
+            )
         else:
             kept = folder / Path(job.name).name
             write_bytes(kept, data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -82,7 +83,7 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
     if report.stopped:
         console.errors.print(
             f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
-            f"amrepair loop --resume {folder.path} --approve ask"
+            f"amrepair loop --resume {shlex.quote(str(folder.path))} --approve ask"
         )
     if code := exit_code_of(report):
         raise typer.Exit(code)

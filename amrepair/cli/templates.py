@@ -100,7 +100,8 @@ def fit(
     told: dict[str, Any] = {}
     with bars.shown():
         if scans and recipe == "fast":
-            clouds = _clouds(scans, sensors(sensor_at), scan_unit)
+            with bars.stage("read scans"):
+                clouds = _clouds(scans, sensors(sensor_at), scan_unit)
             made = _from_scans(clouds, scans, meshes, poses, turntable, seed, bars)
             template, told = made.template, made.as_json([str(path) for path in scans])
         elif recipe == "fast" and len(meshes) == 1:

@@ -26,6 +26,7 @@ from amrepair.scans import Scan
 from amrepair.scans.ply import mm_per
 from amrepair.template.port import Template
 from gcode.profiles import PrinterProfile
+from gcode.surfaces.sizes import in_words
 from gcode.whole import put_in_place
 
 SENSOR_RIGID = 1e-4
@@ -327,7 +328,7 @@ def read_calibration(path: Path | None) -> tuple[Transform, str | None]:
         matrix, unit = np.array(words["build_from_scanner"], float), words.get("scan_unit")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"the calibration {path} cannot be read ({error}); it is a JSON object with "
+            f"the calibration {path} cannot be read ({in_words(error)}); it is a JSON object with "
             "build_from_scanner, a 4×4 matrix"
         ) from error
     if matrix.shape != (4, 4):

@@ -106,22 +106,19 @@ class Run:
 
         What is to be expected at the `coming` stop is made meanwhile.
         """
-        first, lines = self._next_line, self._base + self._checked.program.text.count("\n")
+        first, lines = self._next_line, self._base + _lines(self._checked)
         end = self._course.line(end)
         if first >= end:
             return
-
-        def whole_job(stage: str, done: float, total: float) -> None:
-            """The link tells of this part; people want to know of the job."""
-            self._progress("print", float(first) + done, float(lines))
 
         with self._watch("print"), ThreadPoolExecutor(1) as beside:
             now = None if coming is None else self._course.stop(coming)
             if coming is not None and now is not None and not self._tape.only_read:
                 self._coming = coming, beside.submit(self._site_at, now)
             settling = beside.submit(self.settle)
+            told = self._telling("print", first, end, lines)
             kind, base = ("rest" if self._base else "job"), self._base
-            report = self._wire.send(kind, self._checked, first - base, end - base, whole_job)
+            report = self._wire.send(kind, self._checked, first - base, end - base, told)
         settling.result()
         if report is not None:
             self._job_prints.append(report)
@@ -131,6 +128,15 @@ class Run:
                     "heaters are off"
                 )
         self._next_line = end
+
+    def _telling(self, what: str, first: int, end: int, lines: int) -> Progress:
+        """The link tells of lines [first, end), a server in bytes; people ask for the lines."""
+
+        def told(stage: str, done: float, total: float) -> None:
+            share = done / total if total else 1.0
+            self._progress(what, first + share * (end - first), float(lines))
+
+        return told
 
     def end(self) -> None:
         """The last word on the tape."""
@@ -165,7 +171,9 @@ class Run:
             action = look.decision.action
             if look.printed and look.plan.checked is not None:
                 with self._watch("repair"):
-                    report = self._wire.send("repair", look.plan.checked)
+                    lines = _lines(look.plan.checked)
+                    told = self._telling("repair", 0, lines, lines)
+                    report = self._wire.send("repair", look.plan.checked, progress=told)
                     if report is not None:
                         self._repair_prints.append(report)
             elif action is Action.STOP or (look.declined and action in ENDED_BY_NO):
@@ -277,6 +285,7 @@ class Run:
             if outcome == "pass by":
                 self._silent += 1
                 self._passed.append(stop)
+                self._progress(f"no look at {stop.label}", 1.0, 1.0)
                 return None
         self._stopped = f"stop: twice the scan did not fit the part: {why}"
         return None
@@ -327,7 +336,7 @@ class Run:
             with self._watch("scan"):
                 scan = self._tape.scan(number, str(taped["frame"]))
         else:
-            self._wire.go_live()
+            self._wire.go_live(self._progress)
             scan = scan or self._scan(stop)
         with ThreadPoolExecutor(1) as beside:  # the disk need not wait for the plan, nor it for it
             kept = beside.submit(self._keep_scan, number, scan) if taped is None else None
@@ -451,6 +460,10 @@ class Run:
             if fills and not (barred or situation.last_pass or situation.stuck):
                 return replace(look, printed=self._approval.approve(look.plan))
         return look
+
+
+def _lines(checked: CheckedProgram) -> int:
+    return checked.program.text.count("\n")
 
 
 def _why(decision: Decision) -> str:

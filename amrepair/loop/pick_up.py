@@ -21,6 +21,7 @@ from gcode.hosts.journal import Journal
 from gcode.hosts.port import PrintableProgram, Printer, PrintReport
 from gcode.hosts.resume import back_to_start, resume
 from gcode.hosts.serial import SerialPrinter
+from gcode.progress import Progress, silent
 
 if TYPE_CHECKING:
     from gcode.hosts.served_job import ServedJob
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 def pick_up(
     printer: Printer, *, release_c: float, pose_confirmed: bool = False
-) -> Callable[[Sequence[Sent]], PrintReport | None]:
+) -> Callable[[Sequence[Sent], Progress], PrintReport | None]:
     """What `run_loop` calls before the first thing that its tape lacks, whatever the printer.
 
     Parameters
@@ -65,14 +66,24 @@ def pick_up(
 
 
 def _by_served_job(
-    job: ServedJob[Any], sent: Sequence[Sent], *, release_c: float, pose_confirmed: bool
+    job: ServedJob[Any],
+    sent: Sequence[Sent],
+    _progress: Progress,
+    *,
+    release_c: float,
+    pose_confirmed: bool,
 ) -> None:
     told = [(s.checked, s.first, s.end, s.done) for s in sent]
     job.pick_up(told, release_c=release_c, pose_confirmed=pose_confirmed)
 
 
 def _by_server(
-    server: ServerPrinter[Any], sent: Sequence[Sent], *, release_c: float, pose_confirmed: bool
+    server: ServerPrinter[Any],
+    sent: Sequence[Sent],
+    progress: Progress,
+    *,
+    release_c: float,
+    pose_confirmed: bool,
 ) -> PrintReport | None:
     from gcode.hosts.rejoin import rejoin
 
@@ -91,6 +102,7 @@ def _by_server(
         before=_spans(before),
         release_c=release_c,
         pose_confirmed=pose_confirmed,
+        progress=progress,
     )
 
 
@@ -98,6 +110,7 @@ def _by_journal(
     serial: SerialPrinter,
     journal: Journal,
     sent: Sequence[Sent],
+    progress: Progress,
     *,
     release_c: float,
     pose_confirmed: bool,
@@ -119,6 +132,7 @@ def _by_journal(
                 before=before,
             )  # fmt: skip
             return None
+        under_way = k == len(sent) - 1 and not one.done  # else there is nothing left of it to tell
         report = resume(
             serial,
             one.checked,
@@ -126,8 +140,9 @@ def _by_journal(
             pose_confirmed=pose_confirmed,
             end=one.end,
             before=before,
+            progress=_of_all(progress, one.end - one.first) if under_way else silent,
         )
-        return report if k == len(sent) - 1 and not one.done else None
+        return report if under_way else None
     if latest is None and len(sent) == 1:
         serial.connect()  # killed before the first line
         return None
@@ -137,6 +152,15 @@ def _by_journal(
         f"'{sent[-1].kind}' ({sent[-1].checked.program.sha256[:12]}): somebody has printed "
         "on this port since, or it is another port; the run cannot be gone on with"
     )
+
+
+def _of_all(progress: Progress, lines: int) -> Progress:
+    """What is told of the lines that are left, as of all that were to be sent."""
+
+    def told(stage: str, done: float, total: float) -> None:
+        progress(stage, lines - total + done, float(lines))
+
+    return told
 
 
 def _before(sent: Sequence[Sent], k: int) -> Sequence[Sent]:

@@ -20,7 +20,7 @@ from amrepair.repair import Site
 from amrepair.scans import Scanner
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
-from gcode.hosts.port import Printer
+from gcode.hosts.port import MakesSafe, Printer
 from gcode.process import gives_back
 from gcode.progress import Progress, silent
 from gcode.reader import Job
@@ -110,8 +110,16 @@ def run_loop(
     except TapeEndsError:
         pass
     except BaseException:
-        with contextlib.suppress(GcodeError, OSError):
-            printer.heaters_off()
+        _leave_safe(printer)
         raise
     run.settle()
     return run.report()
+
+
+def _leave_safe(printer: Printer) -> None:
+    """Off with the heaters, and on a cable the nozzle up; the failure stays what is told."""
+    with contextlib.suppress(GcodeError, OSError):
+        if isinstance(printer, MakesSafe):
+            printer.make_safe()  # it waits for no heater that is under way
+        else:
+            printer.heaters_off()

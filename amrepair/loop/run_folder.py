@@ -30,6 +30,7 @@ from gcode.check import CheckedProgram, check, policy_of
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, ProcessProfile, load_setup
 from gcode.reader import Job, job_for
+from gcode.surfaces.sizes import in_words
 from gcode.whole import write_bytes
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
@@ -237,7 +238,7 @@ def open_run(folder: Path) -> Recorded:
         policy = PolicyOptions(**said.pop("policy"))
         setting = Setting(policy=policy, **{key: as_tuples(value) for key, value in said.items()})
     except (KeyError, TypeError) as error:
-        raise InputError(f"{folder / SETTING} cannot be read ({error})") from error
+        raise InputError(f"{folder / SETTING} cannot be read ({in_words(error)})") from error
     setup = setting.setup()
     job = job_for(text, setup.printer)
     stops = (

@@ -17,8 +17,8 @@ from gcode.hosts.port import Printer, PrintReport, PullsAtRest, TellsTouches
 from gcode.hosts.touching import felt
 from gcode.progress import Progress, silent
 
-PickUp = Callable[[Sequence[Sent]], PrintReport | None]
-"""Finds out where the printer is, and has it finish what it was sent last."""
+PickUp = Callable[[Sequence[Sent], Progress], PrintReport | None]
+"""Finds out where the printer is, and has it finish what it was sent last, telling how far."""
 
 
 class Wire:
@@ -53,7 +53,7 @@ class Wire:
         if self._tape.only_read:
             return None
         end = checked.program.text.count("\n") if end is None else end
-        done, report = self._begin(Sent(kind, checked, first, end, done=False))
+        done, report = self._begin(Sent(kind, checked, first, end, done=False), progress)
         if done is not None:
             return report_from_json(done["report"])
         if report is None:
@@ -118,21 +118,31 @@ class Wire:
         self._tape.write(REST, pulled_mm=pulled_mm)
         return pulled_mm
 
-    def go_live(self) -> PrintReport | None:
+    def go_live(self, progress: Progress = silent) -> None:
         """Before the first thing that the tape lacks: where is the printer?"""
+        if self._pick_up is not None:
+            progress("connect", 0.0, 1.0)
+            self._find(silent)
+            progress("connect", 1.0, 1.0)
+
+    def _find(self, progress: Progress) -> PrintReport | None:
+        """The printer, and the report of what it has finished only now."""
         if self._pick_up is None:
             return None
+        progress("printing", 0.0, 1.0)
         pick_up, self._pick_up = self._pick_up, None
-        return pick_up(tuple(self._sent))
+        return pick_up(tuple(self._sent), progress)
 
-    def _begin(self, one: Sent) -> tuple[dict[str, Any] | None, PrintReport | None]:
+    def _begin(
+        self, one: Sent, progress: Progress = silent
+    ) -> tuple[dict[str, Any] | None, PrintReport | None]:
         """What the tape has of the end of what is to be sent; else it is on the tape now.
 
         With it comes the report of whoever has finished it after a kill.
         """
         began = self._tape.next("send")
         if began is None:
-            self.go_live()
+            self._find(progress)
             self._tape.write(
                 "send", kind=one.kind, sha256=one.checked.program.sha256, first=one.first,
                 end=one.end,
@@ -144,7 +154,7 @@ class Wire:
             self._sent.append(replace(one, done=True))
             return self._tape.next("sent"), None
         self._sent.append(one)
-        return None, self.go_live()
+        return None, self._find(progress)
 
     def _end(self, **said: Any) -> None:
         self._sent[-1] = replace(self._sent[-1], done=True)

@@ -8,6 +8,7 @@ as a file by name. (Where a scanner hangs over the bed is another thing: `amrepa
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from scipy.special import stdtr, stdtrit
 
 from amrepair.arrays import Values
 from amrepair.errors import InputError
+from gcode.surfaces.sizes import in_words
 from gcode.whole import write_bytes
 
 CALIBRATION_VERSION = 4
@@ -167,7 +169,7 @@ class Calibration:
             known = f"there are {', '.join(there)}" if there else "there is none yet"
             raise InputError(
                 f"no calibration is named '{name}' in {folder}; {known}: make it with 'amrepair "
-                f"calibrate --sound SCAN --template FILE --name {name}'"
+                f"calibrate --sound SCAN --template FILE --name {shlex.quote(name)}'"
             )
         try:
             said: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -178,7 +180,9 @@ class Calibration:
                 )
             return cls(**{key: as_tuples(value) for key, value in said.items()})
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
-            raise InputError(f"{path}: the calibration cannot be read ({e}); make it again") from e
+            raise InputError(
+                f"{path}: the calibration cannot be read ({in_words(e)}); make it again"
+            ) from e
 
 
 def of_touches(sigma_mm: float, process_sigma_mm: float) -> Calibration:

@@ -290,7 +290,15 @@ MAY_BE_UNKNOWN = ("missing_mm3_after", "excess_mm3_after", "repaired_ratio")
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """The figures of a run that a person asks for first; None where they are not known."""
+    """The figures of a run that a person asks for first; None where they are not known.
+
+    Attributes
+    ----------
+    looked
+        Whether a scan of the part was had at all; a loop whose scanner is silent has none.
+    passed_by
+        Looks that were due and had no scan.
+    """
 
     missing_mm3_before: float
     missing_mm3_after: float | None
@@ -304,13 +312,23 @@ class Figures:
     print_time_s: float
     unprintable_mm3: float = 0.0
     covered_mm3: float = 0.0
+    looked: bool = True
+    passed_by: tuple[str, ...] = ()
 
     @classmethod
     def from_result(cls, result: Mapping[str, object]) -> Figures:
         """The figures of a `--json` result of `simulate`, `repair` or `loop`."""
-        told: dict[str, Any] = {one.name: _number(result, one.name) for one in fields(cls)}
+        names = [one.name for one in fields(cls) if one.name not in ("looked", "passed_by")]
+        told: dict[str, Any] = {name: _number(result, name) for name in names}
         told |= {name: value or 0.0 for name, value in told.items() if name not in MAY_BE_UNKNOWN}
-        return cls(**told | {"iterations": int(told["iterations"])})
+        looked, passed = result.get("stops") != [], result.get("passed_by")
+        if not looked:
+            told |= {"missing_mm3_before": math.nan, "missing_mm3_after": None}
+        return cls(
+            **told | {"iterations": int(told["iterations"])},
+            looked=looked,
+            passed_by=tuple(map(str, passed)) if isinstance(passed, list) else (),
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,6 +190,8 @@ def summary_of_result(
 
 def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:
     missing, excess = figures.missing_mm3_before, figures.excess_mm3_before
+    if not figures.looked:
+        return "The part was not looked at: what is missing is not known."
     listed = kinds(regions)
     where = f" ({listed})" if listed else ""
     if missing > NEGLIGIBLE_MM3 and excess > NEGLIGIBLE_MM3:
@@ -204,6 +206,8 @@ def _found(figures: Figures, regions: Sequence[RegionRow]) -> str:
             f"Nothing is missing, but {quantity(excess, 'mm³')} too much stands there{where}; "
             "printing cannot take it away."
         )
+    if figures.passed_by:
+        return "Nothing was missing at the looks that had a scan."
     return "Nothing is missing: the part agrees with its template."
 
 
@@ -226,7 +230,9 @@ def _done(figures: Figures) -> str:
 
 def _left(outcome: Outcome, figures: Figures) -> str:
     parts = []
-    if figures.missing_mm3_after is None:
+    if not figures.looked:
+        parts.append("look at it, or scan it and let 'amrepair detect' judge")
+    elif figures.missing_mm3_after is None:
         if outcome is Outcome.NOTHING_TO_REPAIR:
             parts.append("Nothing is left to do")
         elif figures.filament_mm <= 0:
@@ -255,6 +261,8 @@ def _left(outcome: Outcome, figures: Figures) -> str:
             f"no sensor saw {quantity(figures.unseen_area_mm2, 'mm²')} of the surface (what it "
             "stands on included), for which nobody can vouch"
         )
+    if figures.passed_by:
+        parts.append(f"no scan came at {', '.join(figures.passed_by)}")
     text = "; ".join(parts)
     return text[0].upper() + text[1:] + "."
 

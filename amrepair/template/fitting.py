@@ -26,6 +26,7 @@ from amrepair.template.network import PaperSdf
 from amrepair.template.options import DEFAULT_FIT, FitOptions
 from amrepair.template.paper import PUBLISHED_NETWORK, PaperOptions, fit_paper
 from gcode.progress import Progress, silent
+from gcode.surfaces.sizes import in_words
 
 if TYPE_CHECKING:
     import trimesh
@@ -123,7 +124,9 @@ def load_template(path: Path) -> GridSdf | PaperSdf:
             return LearnedSdf.unpacked(path, arrays, head)
         return GridSdf.unpacked(path, arrays, head)
     except (KeyError, TypeError, ValueError) as error:
-        raise TemplateError(f"the template {path} is damaged ({error}); fit it again") from error
+        raise TemplateError(
+            f"the template {path} is damaged ({in_words(error)}); fit it again"
+        ) from error
 
 
 def load_or_fit(

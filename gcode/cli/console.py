@@ -7,13 +7,12 @@ import gc
 import json
 import logging
 import os
-import signal
 import stat
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import ModuleType
 from typing import Any, TypeVar
 
 import typer
@@ -30,7 +29,7 @@ from rich.progress import (
 from rich.text import Text
 
 from gcode.errors import InputError
-from gcode.process import INTERRUPTED
+from gcode.process import INTERRUPTED, interrupted, signals_end_it
 from gcode.profiles.names import Kind, list_profiles
 from gcode.whole import put_in_place
 
@@ -56,14 +55,15 @@ class _Told(Console):
         raise ReaderGoneError
 
 
-# What is told holds names of files and words of firmwares: brackets in it are no markup.
-errors = _Told(stderr=True, highlight=False, soft_wrap=True, markup=False)
-out = _Told(highlight=False, soft_wrap=True, markup=False)
+# What is told holds names of files and words of firmwares: brackets in it are no markup, and a word
+# between colons is no picture.
+errors = _Told(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+out = _Told(highlight=False, soft_wrap=True, markup=False, emoji=False)
 Command = TypeVar("Command", bound=Callable[..., Any])
 _commands: dict[str, list[tuple[str, str, Callable[..., Any]]]] = {}
 _json_shown: list[bool] = []  # by the command under way; a failure after it is not told twice
 _circles_left: list[bool] = []
-_interrupts: list[list[int]] = []  # of the command under way, where `run` runs one: Ctrl+C, …
+_older: dict[Path, tuple[int, int]] = {}  # outputs of the command that are there from before
 
 
 class _TimeLeft(TimeRemainingColumn):
@@ -92,7 +92,7 @@ class Bars:
     def __init__(self) -> None:
         self._tasks: dict[str, TaskID] = {}
         self._bars = Progress(
-            TextColumn("{task.description:<24}"),
+            TextColumn("{task.description:<24}", markup=False),
             BarColumn(),
             TextColumn("{task.fields[share]:>5}"),
             TextColumn("{task.fields[count]}"),
@@ -154,7 +154,7 @@ def starting() -> Iterator[None]:
     """
     with errors.status("loading") if errors.is_terminal else nullcontext():
         yield
-    if _interrupted():
+    if interrupted():
         raise KeyboardInterrupt
 
 
@@ -237,8 +237,28 @@ def writable(path: Path) -> None:
     elif not os.access(folder, os.W_OK):
         why = f"no permission to write in {folder.resolve()}; choose another folder"
     else:
+        if path.is_file():
+            _older.setdefault(path, _mark(path))
         return
     raise InputError(f"{path} cannot be written: {why}.")
+
+
+def _mark(path: Path) -> tuple[int, int]:
+    """What differs once a file was written anew, or is gone."""
+    try:
+        now = path.stat()
+    except OSError:
+        return 0, 0
+    return now.st_ino, now.st_mtime_ns
+
+
+def _left_as_they_were() -> str:
+    """What is to be told of outputs that are there from before, and may be taken for this one's."""
+    left = [str(path) for path, mark in _older.items() if _mark(path) == mark]
+    if not left:
+        return ""
+    ones = "is an older one" if len(left) == 1 else "are older ones"
+    return f"{' and '.join(left)} {ones}, left as before"
 
 
 def write_text(path: Path, text: str) -> None:
@@ -263,30 +283,6 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 
 @contextmanager
-def signals_end_it() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end what is under way as an interrupt does: by its safe exits.
-
-    One that is ignored (`nohup`) stays so.
-    """
-
-    def interrupt(number: int, frame: object) -> None:
-        _note(number)
-        raise KeyboardInterrupt
-
-    ends = {signal.SIGTERM}
-    if sys.platform != "win32":
-        ends.add(signal.SIGHUP)
-    taken = [number for number in ends if signal.getsignal(number) is signal.SIG_DFL]
-    for number in taken:
-        signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)
-
-
-@contextmanager
 def interrupts_as_such() -> Iterator[None]:
     """Within it an interrupt is one wherever it comes: compiled code makes an error of it."""
     try:
@@ -300,35 +296,6 @@ def interrupts_as_such() -> Iterator[None]:
         raise
 
 
-@contextmanager
-def _interrupts_noted() -> Iterator[None]:
-    """Note every interrupt, which is told as ever: what it comes to is not always told as one."""
-
-    def note(number: int, frame: FrameType | None) -> None:
-        _note(number)
-        signal.default_int_handler(number, frame)
-
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if ours:  # it is neither ignored nor somebody else's
-        signal.signal(signal.SIGINT, note)
-    _interrupts.append([])
-    try:
-        yield
-    finally:
-        _interrupts.pop()
-        if ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _note(number: int) -> None:
-    for under_way in _interrupts[-1:]:
-        under_way.append(number)
-
-
-def _interrupted() -> bool:
-    return any(_interrupts[-1:])
-
-
 def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None:
     """Run an application; a known error becomes one sentence and its exit code.
 
@@ -340,7 +307,7 @@ def run(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> None
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     for library in ("trimesh", "tifffile"):  # they log tracebacks; what is wrong we tell once
         logging.getLogger(library).setLevel(logging.CRITICAL)
-    with _interrupts_noted():
+    with signals_end_it():
         code = _exit_code(app, name, known)
     if _circles_left:
         gc.freeze()
@@ -358,6 +325,7 @@ def leave_circles() -> None:
 
 def _exit_code(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> int:
     _json_shown.clear()
+    _older.clear()
     piped = _is_pipe()
     try:
         code = _ended(app, name, known)
@@ -388,11 +356,13 @@ def _ended(app: typer.Typer, name: str, known: tuple[type[Exception], ...]) -> i
         return _failed(f"{name}: {in_words(error)}", InputError.exit_code)
     except Exception:
         # of an interrupt in compiled code, or while a library loads that swallows it (trimesh)
-        if not _interrupted():
+        if not interrupted():
             raise
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer ends so on Ctrl+C, without a word
         return _failed(f"{name}: interrupted", code)
+    if left := _left_as_they_were():
+        errors.print(f"{left}.")
     return code if isinstance(code, int) else 0
 
 
@@ -410,6 +380,8 @@ def _misused(error: Exception) -> int:
 
 def _failed(sentence: str, code: int, style: str | None = None) -> int:
     """Tell of a failure once for people and, where it was asked for, once for programs."""
+    if left := _left_as_they_were():
+        sentence = f"{sentence.rstrip('.')}; {left}."
     errors.print(sentence, style=style)
     if "--json" in sys.argv[1:] and not _json_shown:
         show_json({"error": sentence, "exit_code": code})

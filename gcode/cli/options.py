@@ -89,11 +89,20 @@ def program_text(path: Path) -> str:
     Raises
     ------
     InputError
-        If it cannot be read, or holds no G-code at all: anything passes a check of nothing.
+        If it cannot be read, holds no G-code at all (anything passes a check of nothing), or was
+        cut off.
     """
+    from gcode.reader.ending import cut_off
+
     text = plain_text(path)
     if not any(line.partition(";")[0].strip() for line in text.splitlines()):
         raise InputError(f"{path} has no command in it; slice the part again.")
+    if (cut := cut_off(text)) is not None:
+        raise InputError(
+            f"{path} was cut off at line {cut.line} ({cut.text!r}), as a copy that was not "
+            f"finished: {cut.maker} ends every job with {cut.lacks}, and nothing ends the print; "
+            f"copy it again, or, if it is meant to end there, put M104 S0 at its end."
+        )
     return text
 
 

@@ -123,7 +123,7 @@ def send(
         with bars.shown(), bars.stage("connect"):
             machine.connect()  # a printer that refuses us is not ours to abort
     try:
-        with console.signals_end_it(), console.interrupts_as_such(), bars.shown():
+        with console.interrupts_as_such(), bars.shown():
             if resume and isinstance(machine, SerialPrinter):
                 report = resume_job(
                     machine,

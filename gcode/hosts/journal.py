@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from gcode.errors import JournalError
+from gcode.errors import JournalError, JournalFileError
 
 JOURNAL_VERSION = 2
 """Of the tables below; a journal of another version is not read."""
@@ -151,8 +151,11 @@ class Journal:
             self._db.execute("PRAGMA busy_timeout=5000")
             self._prepare()
         except (sqlite3.Error, OSError) as error:
-            raise JournalError(
-                f"The journal {path} cannot be used ({error}); name another file."
+            in_use = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_BUSY
+            why = getattr(error, "strerror", None) or error
+            raise (JournalError if in_use else JournalFileError)(
+                f"The journal {path} cannot be used ({why}); name another file with --journal, or "
+                f"another folder by XDG_STATE_HOME."
             ) from error
         self._disk: ThreadPoolExecutor | None = None
         self._extension: Future[None] | None = None
@@ -164,7 +167,7 @@ class Journal:
         tables = self._db.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()[0]
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if tables and version != JOURNAL_VERSION:
-            raise JournalError(
+            raise JournalFileError(
                 f"The journal {self.path} is of version {version}, this program writes version "
                 f"{JOURNAL_VERSION}; name another file."
             )

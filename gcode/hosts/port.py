@@ -221,6 +221,14 @@ class Printer(Protocol):
 
 
 @runtime_checkable
+class MakesSafe(Protocol):
+    """A printer that is left safe whatever it is at, though it may say nothing for minutes."""
+
+    def make_safe(self) -> None:
+        """Heaters off and nozzle lifted, by any means left; says loudly if it cannot."""
+
+
+@runtime_checkable
 class TellsTouches(Printer, Protocol):
     """A printer whose server tells where a touch ended."""
 

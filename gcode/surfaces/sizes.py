@@ -108,6 +108,8 @@ def length_of(path: Path) -> int:
 def in_words(error: BaseException) -> str:
     """What a foreign error says, on one line; its kind where it says nothing."""
     said = " ".join(str(error).split())
+    if isinstance(error, KeyError):  # which says what was asked for, and no more
+        said = f"it has no {said}"
     return said[:200] or type(error).__name__
 
 

@@ -183,9 +183,9 @@ import sys
 sys.path[:0] = {path!r}
 from link_helpers import program, moves
 import gcode.hosts.serial as host
-from gcode.cli import console
+from gcode.process import signals_end_it
 host.require_checked = lambda checked: None
-with console.signals_end_it(), host.SerialPrinter(sys.argv[1], supervise=False) as printer:
+with signals_end_it(), host.SerialPrinter(sys.argv[1], supervise=False) as printer:
     tell = lambda stage, done, total: done and print("go", flush=True)
     printer.print(program(["M104 S200", "G28", *moves(50000)]), progress=tell)
 """

@@ -109,7 +109,13 @@ def loop(
     except BaseException:  # noqa: BLE001
         (here / "told").write_text(traceback.format_exc())
         return 5
-    tape = Dying(here / "run", die_after)
+    tape, told_lines = Dying(here / "run", die_after), [0.0]
+
+    def progress(stage: str, done: float, total: float) -> None:
+        if stage == "print":
+            assert told_lines[-1] <= done <= total, (told_lines[-3:], done)
+            told_lines.append(done)
+
     book = Journal(here / "journal.sqlite", step_lines=64, step_s=0.0)
     printer = SerialPrinter(port, journal=book, dialect="prusa", timing=QUICK)
     code = 0
@@ -126,6 +132,7 @@ def loop(
             stops=run.stops,
             options=LoopOptions(silent_stops=int(rough), seed=run.setting.seed),
             records=Records(RunFolder(here / "run").record, tape=tape, pick_up=found),
+            progress=progress,
         )
         told = (
             f"within: {report.within_tolerance}, looks: {len(report.looks)}, "

@@ -37,6 +37,7 @@ from gcode.hosts.moonraker_job import KlipperJob
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.web import Address
 from gcode.moves import Program
+from gcode.process import signals_end_it
 from gcode.profiles import load_setup
 from gcode.reader import job_for, read_job
 from gcode.resumption.head import filament_back_mm, state_at_rest
@@ -125,7 +126,7 @@ def test_an_agent_that_is_asked_to_end_leaves_klippers_print_alone(bench: Bench)
             os.kill(os.getpid(), signal.SIGTERM)
 
     bench.answers = stop
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt), signals_end_it():
         bench.agent()
     assert bench.klipper.print_state == "printing"
     bench.klipper.pause_s = 0.001

@@ -207,6 +207,8 @@ def ended(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> int:
     [
         (KeyboardInterrupt(), 130, "amrepair: interrupted"),
         (InputError("no such thing"), 2, "amrepair: no such thing"),
+        # regression: a word between colons was told as a picture
+        (InputError("--scanner watch:x: [x] is not there"), 2, "watch:x: [x] is not there"),
         (OSError(errno.ENOSPC, "No space left on device"), 2, "No space left on device; free"),
         (PermissionError(errno.EACCES, "Permission denied", "a.npz"), 2, "a.npz: Permission den"),
         (typer.Exit(3), 3, ""),
@@ -223,6 +225,36 @@ def test_every_end_has_its_code_and_one_sentence(
     told = capsys.readouterr().err.strip()
     assert said in told
     assert len(told.splitlines()) == bool(said)
+
+
+@pytest.mark.parametrize("how", ["fails", "ends", "writes"])
+def test_an_output_of_before_is_told_from_this_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str
+) -> None:
+    """regression: a program that was refused left an older one of its name, and none told so."""
+    path = tmp_path / "rest.gcode"
+    path.write_text("G28\n")
+    app = typer.Typer(pretty_exceptions_enable=False)
+
+    @app.command()
+    def go() -> None:
+        console.writable(path)
+        if how == "writes":
+            console.write_text(path, "G28\n")
+        if how == "fails":
+            raise InputError("there is no such layer.")
+
+    monkeypatch.setattr("sys.argv", ["amrepair"])
+    with pytest.raises(SystemExit):
+        console.run(app, "amrepair", (AmrepairError,))
+    assert (
+        capsys.readouterr().err
+        == {
+            "fails": f"amrepair: there is no such layer; {path} is an older one, left as before.\n",
+            "ends": f"{path} is an older one, left as before.\n",
+            "writes": "",
+        }[how]
+    )
 
 
 def test_an_interrupt_that_a_library_swallows_is_told_as_one(
@@ -254,21 +286,25 @@ def test_an_interrupt_that_a_library_swallows_is_told_as_one(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupt_while_libraries_load_is_one_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: signal.Signals
 ) -> None:
-    """regression: `gcode` ended in a traceback."""
+    """regression: `gcode` ended in a traceback, and where it was told to end without a word."""
+    usual = signal.default_int_handler if number is signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)
 
     class Pressed:
         def find_spec(self, name: str, *_: object) -> None:
             if name == "gcode.cli.app":
-                raise KeyboardInterrupt
+                signal.raise_signal(number)
 
     monkeypatch.delitem(sys.modules, "gcode.cli.app")
     monkeypatch.delattr(gcode.cli, "app", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Pressed(), *sys.meta_path])
     with pytest.raises(SystemExit) as end:
         gcode.cli.main()
+    signal.signal(number, before)
     assert end.value.code == 130
     assert capsys.readouterr().err == "gcode: interrupted\n"
 

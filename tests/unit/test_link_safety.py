@@ -18,7 +18,7 @@ from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
 from gcode.cli.sending import send
-from gcode.errors import JournalError, LinkError
+from gcode.errors import JournalError, JournalFileError, LinkError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor
 from gcode.hosts.journal import Journal
@@ -251,8 +251,19 @@ def test_a_journal_of_another_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     with contextlib.closing(sqlite3.connect(path)) as db:
         db.execute("CREATE TABLE job (id INTEGER)")
-    with pytest.raises(JournalError, match="version 0"):
+    with pytest.raises(JournalFileError, match="version 0"):
         Journal(path)
+
+
+def test_a_file_that_is_no_journal_is_bad_input(tmp_path: Path) -> None:
+    """regression: it passed for a fault of the link, exit code 4."""
+    other = tmp_path / "part.stl"
+    other.write_text("solid part\n" * 200)
+    said = r"cannot be used \([^\[]*\); name another file"
+    for path in (other, tmp_path, other / "journal"):
+        with pytest.raises(JournalFileError, match=said) as told:
+            Journal(path)
+        assert told.value.exit_code == 2
 
 
 class Occupied:

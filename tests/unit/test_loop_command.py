@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from amrepair.cli import running
 from amrepair.cli.app import app
-from amrepair.cli.live import NoView, ViewPlace
+from amrepair.cli.live import NoView
+from amrepair.errors import AmrepairError, ScannerError
 from amrepair.repair import Stopwatch
 from gcode.cli import console
 
@@ -27,7 +28,7 @@ def number(request: pytest.FixtureRequest) -> Iterator[signal.Signals]:
 
 
 def test_a_loop_that_is_told_to_end_takes_its_safe_exits(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """regression: it was killed on the spot, without a word, where no fleet supervised it."""
 
@@ -35,24 +36,14 @@ def test_a_loop_that_is_told_to_end_takes_its_safe_exits(
         signal.raise_signal(number)
         pytest.fail("it goes on")
 
-    setting = SimpleNamespace(approve="auto", title="a job")
+    setting = SimpleNamespace(approve="auto", title="a job", scanner="probe")
     monkeypatch.setattr(running, "gone_on_with", lambda *_: SimpleNamespace(setting=setting))
     monkeypatch.setattr(running, "_printed", printed)
-    said: dict[str, Any] = dict.fromkeys(("port", "scanner", "approve"))
-    with pytest.raises(KeyboardInterrupt):
-        running.run(
-            None,
-            None,
-            Path(),
-            (None, None, "repair_0.20"),
-            running.Looks(),
-            None,
-            ViewPlace(False, "127.0.0.1", 0, None),
-            resume=Path("run"),
-            pose_confirmed=False,
-            as_json=False,
-            **said,
-        )
+    monkeypatch.setattr("sys.argv", ["amrepair", "loop", "--resume", "run"])
+    with pytest.raises(SystemExit) as end:
+        console.run(app, "amrepair", (AmrepairError,))
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "amrepair: interrupted\n"
     assert signal.getsignal(number) is signal.SIG_DFL
 
 
@@ -69,6 +60,32 @@ def test_an_interrupted_batch_says_how_to_go_on(
     run = CliRunner().invoke(app, words)
     assert run.exit_code == 130
     assert "kept in out/batch; the same command goes on with it." in " ".join(run.stderr.split())
+
+
+@pytest.mark.parametrize("printed", [True, False])
+def test_a_run_that_a_scanner_ends_says_how_to_go_on(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    printed: bool,
+) -> None:
+    """regression: it said what was wrong alone, as if the print were lost."""
+
+    def silent(*_: Any, **__: Any) -> None:
+        raise ScannerError("scans: no usable scan")
+
+    folder = tmp_path / "my run"
+    folder.mkdir()
+    if printed:
+        (folder / "run.jsonl").write_text('{"event": "send"}\n')
+    monkeypatch.setattr(running, "_machine", lambda _: SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr(running, "print_run", silent)
+    begun: Any = SimpleNamespace(folder=SimpleNamespace(path=folder))
+    how: dict[str, Any] = {"view": False, "going_on": False, "pose": False, "desk": None}
+    with pytest.raises(ScannerError):
+        running._printed(begun, NoView(), Stopwatch(), console.Bars(), **how)
+    told = f"When that is mended, go on with: amrepair loop --resume '{folder}'\n"
+    assert capsys.readouterr().err == (told if printed else "")
 
 
 def test_an_interrupt_in_compiled_code_says_how_to_go_on(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_bench import LAYER, Small, scan_of
+from loop_bench import LAYER, Small, Thermal, scan_of
 
 from amrepair.errors import ScannerError
 from amrepair.frames import Transform
@@ -166,7 +166,12 @@ def silent(n: int) -> Scan:
 
 
 def test_a_silent_scanner_does_not_cost_the_print(small: Small, tmp_path: Path) -> None:
-    report, sent = small.run(tmp_path, silent, silent_stops=1, tape=Tape(tmp_path))
+    told: list[str] = []
+    report, sent = small.run(
+        tmp_path, silent, silent_stops=1, tape=Tape(tmp_path),
+        progress=lambda stage, *_: told.append(stage),
+    )  # fmt: skip
+    assert told.count(f"no look at layer-{LAYER:03d}") == 1  # regression: it was passed in silence
     assert [stop.label for stop in report.passed] == [f"layer-{LAYER:03d}"]
     assert not report.looks
     assert not report.within_tolerance
@@ -178,6 +183,26 @@ def test_a_scanner_that_is_gone_ends_the_run(small: Small, tmp_path: Path) -> No
     with pytest.raises(ScannerError, match="nothing new"):
         small.run(tmp_path, silent)
     assert not to_its_end(small, (tmp_path / "sent.gcode").read_text().splitlines())
+
+
+@pytest.mark.parametrize("on_a_cable", [True, False])
+def test_a_run_that_is_interrupted_leaves_the_printer_safe_whatever_it_is_at(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_a_cable: bool
+) -> None:
+    """regression: on a cable the nozzle stayed in the part, and heaters on until they were hot."""
+    told: list[str] = []
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Thermal, "print", interrupted)
+    monkeypatch.setattr(Thermal, "heaters_off", lambda _: told.append("heaters off"))
+    if on_a_cable:
+        safe = lambda _: told.append("safe")  # noqa: E731
+        monkeypatch.setattr(Thermal, "make_safe", safe, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        small.run(tmp_path, silent)
+    assert told == ["safe" if on_a_cable else "heaters off"]
 
 
 def test_a_scan_that_does_not_fit_is_taken_again_before_the_run_ends(

@@ -17,6 +17,7 @@ from amrepair.loop.sites import sites
 from amrepair.report.folder import RunFolder
 from amrepair.scans import Scan
 from gcode.hosts.modes import Modes, follow
+from gcode.progress import Progress, silent
 from tests.draws import draws
 
 
@@ -51,7 +52,13 @@ def small() -> Small:
 
 
 def run(
-    small: Small, folder: Path, fake: Following, scans: Callable[[int], Scan], *, going_on: bool
+    small: Small,
+    folder: Path,
+    fake: Following,
+    scans: Callable[[int], Scan],
+    *,
+    going_on: bool,
+    progress: Progress = silent,
 ) -> LoopReport:
     printer = printer_at(fake)
     tape = Tape(folder)
@@ -70,6 +77,7 @@ def run(
                 tape=tape,
                 pick_up=pick_up(printer, release_c=40.0) if going_on else None,
             ),
+            progress=progress,
         )
     finally:
         printer.close()
@@ -126,15 +134,32 @@ def test_a_killed_loop_goes_on_over_a_server(
 
         def later(request: object) -> object:
             """It ends while it is being followed."""
-            if len(server.printed) == before and time.monotonic() > end_s:
+            began_s.append(time.monotonic())
+            if len(server.printed) == before and began_s[-1] > began_s[0] + 0.3:
                 server.finish()
             return asked(request)  # type: ignore[arg-type]
 
-        end_s = time.monotonic() + 0.3
+        began_s: list[float] = []
         server.server.handle = later  # type: ignore[assignment]
     looked = sum(event["event"] == "look" for event in events[: cut + 1])
     broken = small.standing - small.block(-0.8, 0.2)
     scans = [broken, small.standing][looked:]
-    report = run(small, tmp_path, server, lambda n: scan_of(scans[n - 1]), going_on=True)
+    told = []
+    report = run(
+        small, tmp_path, server, lambda n: scan_of(scans[n - 1]), going_on=True,
+        progress=lambda *one: told.append(one),
+    )  # fmt: skip
     assert [look.printed for look in report.looks] == [True, False]
     assert server.printed == printed
+    # regression: a server tells how many bytes are printed, which were taken for lines of the job
+    lines = float(small.checked.program.text.count("\n"))
+    printing = [(done, total) for stage, done, total in told if stage == "print"]
+    assert all(total == lines for _, total in printing)
+    done = [done for done, _ in printing]
+    assert done == sorted(done)
+    assert done[-1] == lines
+    if kind == "repair" and state != "over":
+        # regression: a repair was printed, or followed after a kill, without a word
+        repairing = [done / total for stage, done, total in told if stage == "repair"]
+        assert repairing[0] == 0.0
+        assert repairing[-1] == 1.0

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from amrepair.errors import InputError, LoopError
-from amrepair.loop.tape import TAPE, Tape, TapeEndsError, read_events
+from amrepair.loop import pick_up as picking
+from amrepair.loop.tape import TAPE, Sent, Tape, TapeEndsError, read_events
+from gcode.progress import Progress
 
 
 def test_what_was_written_comes_back_in_order(tmp_path: Path) -> None:
@@ -90,3 +94,35 @@ def test_without_a_path_nothing_is_remembered() -> None:
     tape.write("send", kind="job")
     assert tape.live
     assert tape.next("send") is None
+
+
+@pytest.mark.parametrize(
+    ("sent", "told"),
+    [
+        # of the last 100 lines 40 are left
+        ([("a", True), ("b", False)], [(60.0, 100.0), (100.0, 100.0)]),
+        # regression: lines of a part that was printed before were told as those of the next one
+        ([("a", True), ("b", True)], []),
+        ([("b", False), ("a", False)], []),
+    ],
+)
+def test_a_resumed_run_tells_of_the_part_that_is_under_way(
+    monkeypatch: pytest.MonkeyPatch, sent: list[tuple[str, bool]], told: list[tuple[float, float]]
+) -> None:
+    def resumed(*_: object, progress: Progress, **__: object) -> None:
+        for done in (0.0, 40.0):
+            progress("printing", done, 40.0)
+
+    monkeypatch.setattr(picking, "resume", resumed)
+    journal: Any = SimpleNamespace(latest=lambda: SimpleNamespace(program_sha256="b"))
+    serial: Any = SimpleNamespace(port="/dev/ttyACM0")
+    parts: list[Any] = []
+    for name, done in sent:
+        checked: Any = SimpleNamespace(program=SimpleNamespace(sha256=name))
+        parts.append(Sent("job", checked, 300, 400, done))
+    heard: list[tuple[float, float]] = []
+    picking._by_journal(
+        serial, journal, parts, lambda _, done, total: heard.append((done, total)),
+        release_c=40.0, pose_confirmed=False,
+    )  # fmt: skip
+    assert heard == told

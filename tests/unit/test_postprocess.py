@@ -23,6 +23,7 @@ from amrepair.errors import InputError
 from amrepair.postprocess import LooksAsked, mark, target_of
 from amrepair.postprocess.mark import decoded
 from gcode.check import Policy, find_refusals
+from gcode.cli import console
 from gcode.cli.app import app as gcode_app
 from gcode.moves import Program
 from gcode.profiles import load_setup
@@ -96,12 +97,16 @@ def test_all_but_the_looks_stays_as_it_was() -> None:
     ]
 
 
-def test_line_ends_and_odd_bytes_stay(tmp_path: Path) -> None:
+def test_line_ends_and_odd_bytes_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # regression: a large job was marked for ten seconds without a word
+    told: list[str] = []
+    monkeypatch.setattr(console.Bars, "__call__", lambda _, stage, *__: told.append(stage))
     odd = job().replace("\n", "\r\n").encode() + b"; \xff\xfe no UTF-8\r\n"
     file = tmp_path / "job.gcode"
     file.write_bytes(odd)
     file.chmod(0o640)
     done = CliRunner().invoke(app, ["postprocess", "--for", "prusa", "--every", "5", str(file)])
+    assert told == ["mark", "mark", "write", "write"]
     assert done.exit_code == 0, done.output
     data = file.read_bytes()
     assert data.count(b"M601\r\n") == 4

@@ -289,9 +289,13 @@ def test_a_calibration_is_kept_by_name_and_read_again(
 
 def test_a_calibration_that_is_not_there_names_those_that_are(tmp_path: Path) -> None:
     (tmp_path / "bench.json").write_text("{}")
+    # regression: the command that is shown could not be typed
+    with pytest.raises(InputError, match="--template FILE --name 'my desk''"):
+        Calibration.load("my desk", tmp_path)
     with pytest.raises(InputError, match=r"no calibration is named 'desk'.*there are bench"):
         Calibration.load("desk", tmp_path)
-    with pytest.raises(InputError, match="cannot be read"):
+    # regression: it said ('version') alone
+    with pytest.raises(InputError, match=r"cannot be read \(it has no 'version'\); make it again"):
         Calibration.load("bench", tmp_path)
     (tmp_path / "bench.json").write_text(json.dumps({"version": 99}))
     with pytest.raises(InputError, match="another version"):

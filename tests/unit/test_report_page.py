@@ -343,6 +343,22 @@ def test_assets_are_found_as_package_data() -> None:
         assert len(document_module._asset(name)) > 1000
 
 
+def test_a_part_that_nobody_looked_at_is_not_called_sound() -> None:
+    """regression: a loop whose scanner was silent told that the part agrees with its template."""
+    result = {"stops": [], "passed_by": ["layer-029", "final"], "missing_mm3_before": 0.0}
+    found, _, left = summary_of_result(result | {"missing_mm3_after": 0.0}, within_tolerance=False)
+    assert found == "The part was not looked at: what is missing is not known."
+    assert "missing any more" not in left
+    assert left.endswith("; no scan came at layer-029, final.")
+    result |= {"stops": [{}], "passed_by": ["final"], "missing_mm3_after": 0.0}
+    found, _, left = summary_of_result(result, within_tolerance=False)
+    assert found == "Nothing was missing at the looks that had a scan."
+    assert left == "Nothing is missing; no scan came at final."
+    result |= {"passed_by": []}
+    found, _, left = summary_of_result(result, within_tolerance=True)
+    assert found == "Nothing is missing: the part agrees with its template."
+
+
 def test_a_plan_that_leaves_something_is_not_said_to_be_printed() -> None:
     figures = Figures(44.0, None, 0.0, None, None, 20.0, 0.0, 1, 12.0, 36.0)
     said = summary(Outcome.NOT_WITHIN_TOLERANCE, figures, ())[1]
