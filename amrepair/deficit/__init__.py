@@ -7,7 +7,12 @@ on the bed. It does not decide what to print. `compute.compute_deficit` is the w
 """
 
 from amrepair.deficit.compute import AsBuilt, Deficit, Standing, compute_deficit, measured_regions
-from amrepair.deficit.heights import as_built_heights, with_others, with_what_stands_out
+from amrepair.deficit.heights import (
+    as_built_heights,
+    heights_beside,
+    with_others,
+    with_what_stands_out,
+)
 from amrepair.deficit.line_heights import standing_in_job
 
 __all__ = [
@@ -16,6 +21,7 @@ __all__ = [
     "Standing",
     "as_built_heights",
     "compute_deficit",
+    "heights_beside",
     "measured_regions",
     "standing_in_job",
     "with_others",

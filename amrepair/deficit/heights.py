@@ -293,6 +293,47 @@ def with_others(field: HeightField, others: HeightField) -> HeightField:
     return bare.raised(others.z_mm[iy, ix])
 
 
+def heights_beside(
+    field: HeightField,
+    points_mm: Points,
+    spacing_mm: float,
+    *,
+    over_mm: float,
+    within_mm: tuple[float, float, float, float],
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
+) -> HeightField | None:
+    """What a scan shows around a field that stands higher than the head goes past it.
+
+    Parameters
+    ----------
+    points_mm
+        (n, 3) of all of the scan, build frame.
+    over_mm, within_mm
+        Only what is higher than this counts, and lies in this rectangle of the bed
+        (x_min, y_min, x_max, y_max).
+
+    Returns
+    -------
+    Heights of it, 0 where there is none; None if there is none at all.
+    """
+    x, y, z = points_mm.T
+    x0, y0, x1, y1 = field.box_mm
+    inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+    left, front, right, back = within_mm
+    high = (z > over_mm) & ~inside & (x > left) & (x < right) & (y > front) & (y < back)
+    if not high.any():
+        return None
+    points = points_mm[high]
+    cell_mm = max(options.cell_mm, 1.2 * spacing_mm)
+    # with an empty cell on each side, as which everything around it counts
+    low = points[:, :2].min(axis=0) - cell_mm
+    nx, ny = (int(n) + 3 for n in np.ptp(points[:, :2], axis=0) / cell_mm)
+    shape = (ny, nx)
+    grid = HeightField(low, cell_mm, np.zeros(shape), np.zeros(shape, bool))
+    z_mm, seen = _tops(points, grid, spacing_mm, options)
+    return replace(grid, z_mm=np.where(seen, z_mm, 0.0), seen=seen) if seen.any() else None
+
+
 def _without_rims_fins(
     z_mm: HeightMap, gone: ColumnMask, seen_mm: HeightMap, options: HeightOptions
 ) -> HeightMap:

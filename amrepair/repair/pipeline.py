@@ -19,6 +19,7 @@ from amrepair.deficit import (
     Standing,
     as_built_heights,
     compute_deficit,
+    heights_beside,
     standing_in_job,
     with_others,
     with_what_stands_out,
@@ -134,7 +135,9 @@ def plan_repair(
         as_built = deficit.as_built  # made where it is needed: a clean layer has no use for it
         if site.finished is not None:
             as_built = _among_finished(as_built, laid, anomaly, site.finished, site)
-            plan = replace(plan, deficit=replace(deficit, stands=Standing(lambda: as_built)))
+        elif scan.frame == "build" and not site.on_fixture:
+            as_built = _among_others(as_built, laid, anomaly, missing, site)
+        plan = replace(plan, deficit=replace(deficit, stands=Standing(lambda: as_built)))
     with watch("slice"):
         lines = lines_of(site, deficit, laid.placed)
         patch = _slice(missing, as_built, site, interruption, lines, progress)
@@ -368,6 +371,33 @@ def _among_finished(
         site.options.deficit.heights,
     )
     return with_others(as_built, others)
+
+
+def _among_others(
+    as_built: HeightField,
+    laid: _Laid,
+    anomaly: AnomalyMap,
+    missing: manifold3d.Manifold,
+    site: Site,
+) -> HeightField:
+    """The heights of the part joined with those of what else the scan shows on the bed.
+
+    The field itself is as wide as the nozzle's cone. What stands farther off must be known where
+    wider parts of the head would touch it, or the nozzle on its way to the part.
+    """
+    assert anomaly.evidence is not None
+    printer, options = site.setup.printer, site.options.deficit.heights
+    wider_mm = [s.z_from_mm for s in printer.head if s.reach_mm > options.beside_part_mm]
+    lowest_mm = float(missing.bounding_box()[2]) + min(wider_mm, default=np.inf)
+    others = heights_beside(
+        as_built,
+        laid.placed.apply(laid.whole.points_mm),
+        anomaly.evidence.spacing_mm,
+        over_mm=min(lowest_mm, as_built.top_mm + options.trust_mm),
+        within_mm=printer.bed_box_mm,
+        options=options,
+    )
+    return as_built if others is None else with_others(as_built, others)
 
 
 def _slice(
