@@ -31,6 +31,7 @@ from gcode.compiled import read_only
 from gcode.meshes import mesh_of
 from gcode.surfaces import HeightField, raster_kernels
 
+HALF_AROUND = 4  # of the eight cells around one
 # Directions to the columns around a point; its own comes first, and suffices for most points.
 OWN_COLUMN_FIRST = sorted(itertools.product((-1.0, 0.0, 1.0), repeat=2), key=np.linalg.norm)
 
@@ -412,7 +413,7 @@ def _tops(
         top_mm, mean_mm, count, among = kernels.topmost(column, points, below_mm, band_mm)
         as_high = _neighbours_as_high(top_mm.reshape(grid.shape), band_mm).ravel()
         alone = (count == 1) & (among > 1) & (as_high == 0) & first
-        asked = (count > 0) & (count <= options.others_near) & (as_high < 4) & ~alone
+        asked = (count > 0) & (count <= options.others_near) & (as_high < HALF_AROUND) & ~alone
         which = np.flatnonzero((column >= 0) & asked[column])
         own = column[which]
         inside = (points[which, 2] >= top_mm[own] - band_mm) & (points[which, 2] < below_mm[own])
