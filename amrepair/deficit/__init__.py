@@ -13,7 +13,7 @@ from amrepair.deficit.heights import (
     with_others,
     with_what_stands_out,
 )
-from amrepair.deficit.line_heights import standing_in_job
+from amrepair.deficit.line_heights import lines_beside, standing_in_job
 
 __all__ = [
     "AsBuilt",
@@ -22,6 +22,7 @@ __all__ = [
     "as_built_heights",
     "compute_deficit",
     "heights_beside",
+    "lines_beside",
     "measured_regions",
     "standing_in_job",
     "with_others",

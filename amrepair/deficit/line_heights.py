@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import manifold3d
 import numpy as np
+from jaxtyping import Float
 from scipy import ndimage
 
 from amrepair.arrays import ColumnMask, HeightMap
@@ -86,6 +87,40 @@ def standing_lines(
     return HeightField(fine.origin_mm, fine.cell_mm, z_mm, known)
 
 
+def lines_beside(
+    field: HeightField,
+    lines: JobLines,
+    *,
+    over_mm: float,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
+) -> HeightField | None:
+    """What the job has laid that is higher than the head goes past it; as `heights_beside`."""
+    high = lines.some(lines.end_mm[:, 2] > over_mm)
+    if not len(high.end_mm):
+        return None
+    cell_mm, ends = options.cell_mm, np.concatenate([high.start_mm, high.end_mm])[:, :2]
+    margin_mm = float(high.section_mm2.max() / max(high.height_mm.min(), SAME_LEVEL_MM)) + cell_mm
+    low_mm = ends.min(axis=0) - margin_mm
+    nx, ny = (int(n) + 2 for n in (ends.max(axis=0) + margin_mm - low_mm) / cell_mm)
+    z_mm = _tops_of(high, low_mm, cell_mm, (ny, nx))
+    x0, y0, x1, y1 = field.box_mm
+    x, y = (low + (np.arange(n) + 0.5) * cell_mm for low, n in zip(low_mm, (nx, ny), strict=True))
+    inside = ((y > y0) & (y < y1))[:, None] & ((x > x0) & (x < x1))[None, :]
+    z_mm = np.where(inside | ~np.isfinite(z_mm), 0.0, z_mm)
+    return HeightField(low_mm, cell_mm, z_mm, np.ones((ny, nx), bool)) if z_mm.any() else None
+
+
+def _tops_of(
+    some: JobLines, low_mm: Float[np.ndarray, " 2"], cell_mm: float, shape: tuple[int, int]
+) -> HeightMap:
+    """How high the highest of some lines is in each column; −inf where there is none."""
+    within = 0.5 * some.section_mm2 / np.maximum(some.height_mm, SAME_LEVEL_MM)
+    return heights_by_lines(
+        some.start_mm, some.end_mm, within, some.end_mm[:, 2],
+        low_mm=low_mm, cell_mm=cell_mm, shape=shape,
+    )  # fmt: skip
+
+
 def _steps_of_plan(
     seen_mm: HeightMap,
     told: ColumnMask,
@@ -132,11 +167,7 @@ def _planned(
         return below.reshape(ny, nx)
 
     def over(some: JobLines) -> HeightMap:
-        within = 0.5 * some.section_mm2 / np.maximum(some.height_mm, SAME_LEVEL_MM)
-        return heights_by_lines(
-            some.start_mm, some.end_mm, within, some.end_mm[:, 2],
-            low_mm=near.origin_mm, cell_mm=near.cell_mm, shape=near.shape,
-        )  # fmt: skip
+        return _tops_of(some, near.origin_mm, near.cell_mm, near.shape)
 
     tops_mm = lines.end_mm[:, 2]
     stands_mm = np.maximum(over(lines.some(tops_mm <= low_mm)), 0.0)

@@ -20,6 +20,7 @@ from amrepair.deficit import (
     as_built_heights,
     compute_deficit,
     heights_beside,
+    lines_beside,
     standing_in_job,
     with_others,
     with_what_stands_out,
@@ -380,23 +381,28 @@ def _among_others(
     missing: manifold3d.Manifold,
     site: Site,
 ) -> HeightField:
-    """The heights of the part joined with those of what else the scan shows on the bed.
+    """The heights of the part joined with those of what else stands on the bed.
 
     The field itself is as wide as the nozzle's cone. What stands farther off must be known where
-    wider parts of the head would touch it, or the nozzle on its way to the part.
+    wider parts of the head would touch it, or the nozzle on its way to the part: in a running job,
+    where the head is parked over the bed, from the job's own lines, else from the scan.
     """
     assert anomaly.evidence is not None
     printer, options = site.setup.printer, site.options.deficit.heights
     wider_mm = [s.z_from_mm for s in printer.head if s.reach_mm > options.beside_part_mm]
     lowest_mm = float(missing.bounding_box()[2]) + min(wider_mm, default=np.inf)
-    others = heights_beside(
-        as_built,
-        laid.placed.apply(laid.whole.points_mm),
-        anomaly.evidence.spacing_mm,
-        over_mm=min(lowest_mm, as_built.top_mm + options.trust_mm),
-        within_mm=printer.bed_box_mm,
-        options=options,
-    )
+    over_mm = min(lowest_mm, as_built.top_mm + options.trust_mm)
+    if site.laid is not None and site.lines is not None:
+        others = lines_beside(as_built, site.lines, over_mm=over_mm, options=options)
+    else:
+        others = heights_beside(
+            as_built,
+            laid.placed.apply(laid.whole.points_mm),
+            anomaly.evidence.spacing_mm,
+            over_mm=over_mm,
+            within_mm=printer.bed_box_mm,
+            options=options,
+        )
     return as_built if others is None else with_others(as_built, others)
 
 

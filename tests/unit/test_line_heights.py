@@ -6,6 +6,7 @@ import manifold3d
 import numpy as np
 import pytest
 
+from amrepair.deficit import lines_beside, with_others
 from amrepair.deficit.line_heights import standing_lines
 from gcode.slicing.job_lines import JobLines
 from gcode.surfaces import HeightField
@@ -78,3 +79,19 @@ def test_what_stands_out_stays() -> None:
         HeightField(coarse.origin_mm, coarse.cell_mm, crumb, coarse.seen), job(), missing()
     )
     assert at(sharp, 11.1) == pytest.approx(TOP_MM + 1.0)
+
+
+def test_what_the_job_laid_higher_beside_the_part_is_in_the_heads_way() -> None:
+    # regression: of another object of the job, which went on after this one had ended, the head
+    # knew no more than what lies within a nozzle's cone of the part
+    around = HeightField(np.array([-8.0, 0.0]), 0.25, np.zeros((40, 40)), np.ones((40, 40), bool))
+    lines = job()
+    assert lines_beside(around, lines, over_mm=TOP_MM + 0.1) is None
+    beside = lines_beside(around, lines, over_mm=0.9)
+    assert beside is not None
+    joined = with_others(around, beside)
+    assert at(joined, 10.0) == pytest.approx(TOP_MM)
+    assert at(joined, 3.0) == at(joined, -4.0, 5.0) == 0.0
+    assert at(joined, 4.0) == at(joined, 16.0) == 0.0
+    # of what lies in the field itself it is the scan that tells
+    assert lines_beside(seen(), lines, over_mm=0.9) is None
