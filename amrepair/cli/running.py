@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 from amrepair.cli.approval import AtDesk, Terminal
 from amrepair.cli.live import NoView, ShownRun, ViewPlace, live_view
 from amrepair.cli.scanners import Bed, known_scanner, open_scanner
-from amrepair.cli.telling import Begun, tell, written
+from amrepair.cli.telling import Begun, tell, to_resume, written
 from amrepair.cli.thermal_log import ThermalLog
 from amrepair.errors import InputError, ScannerError
 from amrepair.fleet.desk import Desk
@@ -61,8 +60,6 @@ from gcode.resumption.settings import require_one_frame
 ADAPTIVE_LAYERS = 8  # to the first look, where --every says nothing
 PROFILES = "profiles"  # in the run's folder: those of the job's own settings
 SILENT_STOPS = 2  # a scanner that says nothing at three stops in a row is gone
-
-
 WATCH = "watch:"
 
 
@@ -174,16 +171,13 @@ def _printed(
     except KeyboardInterrupt:
         console.errors.print(
             "The heaters were told to switch off. When somebody has looked, go on with: "
-            f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
+            + to_resume(begun.folder.path)
         )
         raise
     except (ScannerError, LinkError) as error:
         begun_to_print = read_events(begun.folder.path)  # else the same command begins it
         if begun_to_print and not isinstance(error, (ResumeRefusedError, PortBusyError)):
-            console.errors.print(
-                "When that is mended, go on with: "
-                f"amrepair loop --resume {shlex.quote(str(begun.folder.path))}"
-            )
+            console.errors.print(f"When that is mended, go on with: {to_resume(begun.folder.path)}")
         raise
     finally:
         machine.close()
@@ -218,8 +212,8 @@ def new_run(
     before = read_events(out)
     if before and before[-1].get("event") != "end":
         raise InputError(
-            f"{out} holds a run that was not ended; go on with it ('amrepair loop --resume "
-            f"{shlex.quote(str(out))}') or name another folder with --out"
+            f"{out} holds a run that was not ended; go on with it ('{to_resume(out)}') or name "
+            "another folder with --out"
         )
     job = job_for(text, setup.printer)
     require_one_frame(job)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -64,6 +65,11 @@ def written(
     return result
 
 
+def to_resume(folder: Path) -> str:
+    """The command that goes on with a run."""
+    return f"amrepair loop --resume {shlex.quote(str(folder))}"
+
+
 def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: bool) -> None:
     """What became of it, and the exit code."""
     folder, within = begun.folder, report.within_tolerance
@@ -83,7 +89,7 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
     if report.stopped:
         console.errors.print(
             f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
-            f"amrepair loop --resume {shlex.quote(str(folder.path))} --approve ask"
+            f"{to_resume(folder.path)} --approve ask"
         )
     if code := exit_code_of(report):
         raise typer.Exit(code)

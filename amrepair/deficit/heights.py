@@ -23,7 +23,7 @@ from amrepair.deficit import heights_kernels as kernels
 from amrepair.deficit.options import DEFAULT_DEFICIT, HeightOptions
 from amrepair.deficit.walls import window_around
 from amrepair.field.near import has_near
-from amrepair.frames import Transform, box_corners, box_of
+from amrepair.frames import Transform, box_corners, box_of, in_box
 from amrepair.observe.rays import RangeImage, clearances
 from amrepair.scans import Scan
 from amrepair.template.port import Template
@@ -58,7 +58,7 @@ def as_built_heights(
     corners = box_corners(template.bounds_mm)
     box = build_from_template.apply(corners)
     low, high = box.min(axis=0) - options.beside_part_mm, box.max(axis=0) + options.beside_part_mm
-    cell_mm = max(options.cell_mm, 1.2 * spacing_mm)
+    cell_mm = _cell_mm(spacing_mm, options)
     nx, ny = (math.ceil(v) for v in (high[:2] - low[:2]) / cell_mm)
     grid = HeightField(low[:2].copy(), cell_mm, np.zeros((ny, nx)), np.zeros((ny, nx), bool))
     top_z = float(box[:, 2].max()) if printed_z_mm is None else printed_z_mm
@@ -82,6 +82,11 @@ def as_built_heights(
         solid = replace(grid, z_mm=solid_z, seen=known)
         solid_z = _crossed(solid, float(low[2]), build_from_template.inverse(), images, options)
     return replace(grid, z_mm=np.where(known, np.maximum(z, 0.0), solid_z), seen=seen)
+
+
+def _cell_mm(spacing_mm: float, options: HeightOptions) -> float:
+    """Width of the scan's columns: each holds a point of a surface, however sparse."""
+    return max(options.cell_mm, 1.2 * spacing_mm)
 
 
 def _is_cut_to(
@@ -317,15 +322,15 @@ def heights_beside(
     -------
     Heights of it, 0 where there is none; None if there is none at all.
     """
-    x, y, z = points_mm.T
-    x0, y0, x1, y1 = field.box_mm
-    inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
-    left, front, right, back = within_mm
-    high = (z > over_mm) & ~inside & (x > left) & (x < right) & (y > front) & (y < back)
-    if not high.any():
+    points = points_mm[points_mm[:, 2] > over_mm]
+    inside, on_bed = (
+        in_box(points[:, :2], np.array(box[:2]), np.array(box[2:]))
+        for box in (field.box_mm, within_mm)
+    )
+    points = points[on_bed & ~inside]
+    if not len(points):
         return None
-    points = points_mm[high]
-    cell_mm = max(options.cell_mm, 1.2 * spacing_mm)
+    cell_mm = _cell_mm(spacing_mm, options)
     # with an empty cell on each side, as which everything around it counts
     low = points[:, :2].min(axis=0) - cell_mm
     nx, ny = (int(n) + 3 for n in np.ptp(points[:, :2], axis=0) / cell_mm)
