@@ -22,6 +22,8 @@ from amrepair.frames import cells_of, unit_vectors
 WINDOW_FACING = 0.5
 # The third lowest and third highest cell of a window count: three cells are a surface, two chance.
 RANK = 3
+# Cells of a surface hold two points on average; strays lie in a cell of their own each.
+CELL_POINTS = 2.0
 # The weight of a point of what is no surface, beside points of what is: next to none.
 NOTHING = 1e-6
 
@@ -83,11 +85,11 @@ class Scale:
 
     @property
     def is_surface(self) -> Mask:
-        """(s,) whether a window holds surface: `RANK` cells or more, of two points on average.
+        """(s,) whether a window holds surface: `RANK` cells or more, of `CELL_POINTS` on average.
 
         Stray points in the air also share a window now and then, but each in a cell of its own.
         """
-        return np.asarray((self.count >= RANK) & (self.window_weight >= 2.0 * self.count))
+        return np.asarray((self.count >= RANK) & (self.window_weight >= CELL_POINTS * self.count))
 
 
 def scales_of(

@@ -3,7 +3,9 @@
 Views err each on its own: by an offset of the whole view, and by errors that hang together over a
 few millimetres. How far their means over windows lie apart shows both at that width, and nothing of
 what the part itself lacks, which all views see alike. A mean over several views is off by less than
-what only one of them saw.
+what only one of them saw. And where the views of one window contradict what it tells, it is no
+surer than they are apart, however many points one of them has there: a scanner errs by whole
+patches, while what lacks of a part all views lack.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from jaxtyping import Float
 
 from amrepair.arrays import Numbers, Values
 from amrepair.field import scales_kernels
-from amrepair.field.scales import Scale, faced_places
+from amrepair.field.scales import CELL_POINTS, RANK, Scale, faced_places
 from amrepair.observe.robust import MAD_TO_SIGMA
 from amrepair.regions.inspected import Inspected
 
@@ -93,11 +95,15 @@ class ViewErrors:
         Standard deviation of what one view says of a window; 0 where views are not told apart.
     cell_by, window_by
         (s,) how many views a cell of each window is worth, and the median of its cells.
+    here_mm
+        (s,) standard error of what each window tells, by what its own views say; 0 where only one
+        saw it.
     """
 
     one_mm: float
     cell_by: Values
     window_by: Values
+    here_mm: Values
 
     @classmethod
     def of(cls, scale: Scale, said: Said | None) -> Self:
@@ -108,14 +114,35 @@ class ViewErrors:
         counts as seen by one view.
         """
         if said is None:
-            return cls(0.0, np.ones(len(scale)), np.ones(len(scale)))
+            return cls(0.0, np.ones(len(scale)), np.ones(len(scale)), np.zeros(len(scale)))
         points, total_mm, own = said.over(scale)
         alone = np.ones(len(scale.of_base))
         alone[: len(said.own)] = np.square(said.own).sum(axis=1)
         alone = np.bincount(scale.of_base, alone) / np.bincount(scale.of_base)
         cell_by = 1.0 / scales_kernels.window_means(scale.table, scale.count, alone)
         judged = scale.is_surface & ~scale.apart
-        return cls(_one_mm(points[judged], total_mm[judged]), cell_by, _worth(own))
+        one_mm = _one_mm(points[judged], total_mm[judged])
+        return cls(one_mm, cell_by, _worth(own), _here_mm(points, total_mm, scale.median_mm))
+
+
+def _here_mm(
+    points: Float[np.ndarray, "s v"], total_mm: Float[np.ndarray, "s v"], told_mm: Values
+) -> Values:
+    """(s,) standard error of what each window tells, by what its own views say; 0 of one view.
+
+    Each view speaks by its points, up to those that make a surface: more of them err together.
+
+    References
+    ----------
+    Liang & Zeger, "Longitudinal data analysis using generalized linear models", 1986: the variance
+    by clusters, here views.
+    """
+    views = (points > 0.0).sum(axis=1)
+    mean_mm = total_mm / np.maximum(points, 1.0)
+    says = np.minimum(points, RANK * CELL_POINTS)
+    off = np.square(says * (mean_mm - told_mm[:, None])).sum(axis=1)
+    off *= views / np.maximum(views - 1, 1)
+    return np.where(views > 1, np.sqrt(off) / np.maximum(says.sum(axis=1), 1.0), 0.0)
 
 
 def _worth(points: Float[np.ndarray, "s v"]) -> Values:

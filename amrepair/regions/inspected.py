@@ -58,8 +58,7 @@ class Inspected:
     ends
         How many of the places, the last ones, are ends of walls.
     shares
-        What each view says of each cell; None where views are not told apart, or where what they
-        disagree by is in `pose_mm`.
+        What each view says of each cell; None where views are not told apart.
     """
 
     cells: int

@@ -326,7 +326,8 @@ def _errors(
     They are independent from cell to cell, and common to windows; `poses_mm` is what adds to the
     latter, of the `RANK`-th cells and of windows. Windows far apart tell what they
     have in common, and so do views of the same window, which are right too where fewer of them saw
-    a place; they tell of the same errors, and the larger counts.
+    a place, or where they contradict what it tells; they tell of the same errors, and the largest
+    counts.
     """
     classes = int(group.max()) + 1
     # a cell whose few neighbours happen to agree is as noisy as others that were seen as well
@@ -344,7 +345,8 @@ def _errors(
     by_wander = (wander[group] * aslant) ** 2 - options.process_sigma_mm**2
     found = []
     for seen_by, pose_mm in zip((views.cell_by, views.window_by), poses_mm, strict=True):
-        errs = np.maximum(by_wander, views.one_mm**2 / seen_by) - window**2
+        by_views = np.maximum(views.one_mm**2 / seen_by, np.square(views.here_mm))
+        errs = np.maximum(by_wander, by_views) - window**2
         common = np.sqrt(np.maximum(errs, 0.0) + pose_mm**2)
         found.append(Errors(cell, window, common, wander, freedom, group, least))
     return found[0], found[1]

@@ -118,9 +118,9 @@ def _without_nuisance(
     pose_mm = np.hypot(inspected.pose_mm, found.error_mm(inspected.place_mm, inspected.normal))
     if views_known:
         pose_mm = np.hypot(pose_mm, _between_views_mm(left, len(pose_mm), seen.surfels.spread_mm))
-    # what views disagree by is in `pose_mm`, and is not counted by width as well
-    inspected = replace(inspected, value_mm=whole_mm, pose_mm=pose_mm, shares=None)
-    return found, inspected, left if views_known else None
+    shares = left if views_known else None
+    inspected = replace(inspected, value_mm=whole_mm, pose_mm=pose_mm, shares=shares)
+    return found, inspected, shares
 
 
 def _halves_joined(inspected: Inspected, told: Shares) -> tuple[Points, Points, Shares]:

@@ -128,3 +128,27 @@ def test_of_cells_of_one_view_each_a_median_is_worth_what_their_number_says() ->
     assert scale.count[middle] == 9
     assert errors.window_by[middle] == pytest.approx(81.0 / (49.0 + 1.0 + 1.0))
     assert errors.cell_by[middle] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("all_mm", [0.0, -0.6])
+def test_a_window_is_no_surer_than_its_views_are_apart(all_mm: float) -> None:
+    # regression: one view erred by a whole patch, and had more points there than the one that did
+    # not
+    inspected = plate(4, spread_mm=0.0)
+    place_mm = inspected.place_mm
+    patch = np.hypot(*(place_mm[:, :2] - 0.4 * ACROSS_MM).T) < 2.0
+    said_mm = np.random.default_rng(4).normal(scale=NOISE_MM, size=(VIEWS, len(patch)))
+    said_mm[:, patch] += all_mm
+    said_mm[0, patch] = -0.6
+    seen = np.ones(said_mm.shape, bool)
+    seen[2:, patch] = False
+    told_by = seen_by(place_mm, said_mm, seen)
+    assert told_by.shares is not None
+    count = np.where(patch[told_by.shares.place] & (told_by.shares.view == 0), 40, 2)
+    value_mm = np.bincount(told_by.shares.place, count * told_by.shares.value_mm)
+    value_mm /= np.bincount(told_by.shares.place, count)
+    told_by = replace(told_by, value_mm=value_mm, shares=replace(told_by.shares, count=count))
+    assert np.median(value_mm[patch]) < -0.5
+    medians = significance.tested(told_by, RegionOptions(), None)[1:]
+    found = any(level.rejected[0].any() for level in medians)
+    assert found == (all_mm < 0.0)
