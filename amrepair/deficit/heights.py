@@ -258,7 +258,7 @@ def with_what_stands_out(
     ]  # fmt: skip
     if len(out) == 0:
         return field
-    out = out[_is_beside(out, points_mm, spacing_mm, options)]
+    out = out[has_others_beside(out, points_mm, spacing_mm, options)]
     index = field.cells_of(out[:, :2])
     inside = ((index >= 0) & (index < field.shape)).all(axis=1)
     z_mm = np.array(field.z_mm, dtype=np.float64)
@@ -266,13 +266,16 @@ def with_what_stands_out(
     return field.raised(z_mm)
 
 
-def _is_beside(
+def has_others_beside(
     asked_mm: Points,
     points_mm: Float[np.ndarray, "m 3"],
     spacing_mm: float,
-    options: HeightOptions,
+    options: HeightOptions = DEFAULT_DEFICIT.heights,
 ) -> Mask:
-    """(k,) whether some of the points have others beside them, as on a surface."""
+    """(k,) whether some of the points have others beside them, as on a surface.
+
+    Those that have none stray: real scanners have them in mid-air, up to one in fifty.
+    """
     within_mm = options.beside_spacings * spacing_mm
     return has_near(asked_mm, points_mm, within_mm, enough=options.others_near + 1)  # itself too
 
@@ -423,7 +426,7 @@ def _tops(
         own = column[which]
         inside = (points[which, 2] >= top_mm[own] - band_mm) & (points[which, 2] < below_mm[own])
         which = which[inside]
-        asked[column[which[_is_beside(points[which], points, spacing_mm, options)]]] = False
+        asked[column[which[has_others_beside(points[which], points, spacing_mm, options)]]] = False
         strays = alone | asked
         if not strays.any():
             return mean_mm.reshape(grid.shape), count.reshape(grid.shape) > 0

@@ -180,12 +180,17 @@ def _spacing(
     points_mm: Points, keep: Mask, box_mm: Float[np.ndarray, "2 3"], options: SurfelOptions
 ) -> float:
     """`estimate_spacing` of some points."""
-    kept = int(keep.sum())
-    if kept < 2:
+    if keep.sum() < 2:
         return options.most_cell_mm / 2
     cell_mm = 1.0
     while True:
-        occupied = len(_numbered(points_mm, keep, box_mm, cell_mm)[1])
+        of_point, keys, strides = _numbered(points_mm, keep, box_mm, cell_mm)
+        count = np.bincount(of_point[of_point >= 0], minlength=len(keys))
+        table = kernels.neighbour_table(keys, *strides)
+        # a stray point in the air would count as much as a cell of surface
+        near = np.where(table >= 0, count[table], 0).max(axis=1) >= options.least_near
+        near |= not near.any()
+        kept, occupied = int(count[near].sum()), int(near.sum())
         # a cell must hold several points, or the count of cells says nothing about area
         if kept >= 4 * occupied or occupied == 1 or cell_mm > 64.0:
             return float(np.sqrt(options.area_per_cell * occupied * cell_mm**2 / kept))

@@ -15,12 +15,15 @@ class SurfelOptions:
         Edge of a cell in spacings of the scan, between the two.
     area_per_cell
         Occupied unit cells hold about so many cells² of surface each (a plane at a random slope).
+    least_near
+        Of surface a cell, or one of those around it, holds so many points; else they stray.
     """
 
     cell_spacings: float = 2.0
     least_cell_mm: float = 0.3
     most_cell_mm: float = 2.0
     area_per_cell: float = 1.5
+    least_near: int = 3
 
 
 @dataclass(frozen=True, slots=True)

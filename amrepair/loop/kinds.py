@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from amrepair.arrays import Box, Mask, PlanePoints, Values
+from amrepair.deficit.heights import has_others_beside
 from amrepair.frames import Transform, cells_of, turned_rad
 from amrepair.loop.findings import matching
 from amrepair.loop.kind_options import DEFAULT_KINDS, KindOptions
@@ -176,6 +177,8 @@ def _surfaces(
     bed_mm = float(np.median(height[beside])) if len(beside) >= options.least_points else 0.0
     near = np.flatnonzero((np.abs(deviation) < 3.0) & (height > options.low_wall_mm))
     near = near[:: max(1, -(-len(near) // (4 * options.most_points)))]
+    every_mm, apart_mm = plan.anomaly.points_mm, evidence.surfels.spacing_mm
+    near = near[has_others_beside(points[near], every_mm, apart_mm)]
     gradient = expected.distance_and_gradient(points[near])[1]
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     outward = placed.rotate(gradient / np.maximum(length, 1e-9))

@@ -25,6 +25,7 @@ from amrepair.loop.outlines import outermost
 from amrepair.scans import Scan
 from amrepair.template import StoodTemplate
 from amrepair.template.port import Template
+from gcode.meshes import box_of_solid
 from gcode.progress import Progress, silent
 from gcode.reader import Beads, Job
 from gcode.stretches import places_along
@@ -554,8 +555,7 @@ def _on_foot(
     placed: Transform, template: Template, begins_mm: float, layer_height_mm: float
 ) -> Transform:
     """The pose with the part's lowest point where its beads begin: walls tell height the least."""
-    surface, _ = template.surface_points(1.0)
-    low_mm = float(placed.apply(surface)[:, 2].min())
+    low_mm = float(box_of_solid(placed.solid(template.solid()))[0, 2])
     limit_mm = OFF_LAYERS * layer_height_mm
     if abs(low_mm - begins_mm) > limit_mm:
         raise AlignmentError(

@@ -152,6 +152,34 @@ def test_a_chip_is_no_curl(centre: tuple[float, float], radius_mm: float) -> Non
     assert kinds._warped(top_of(chipped, xy, 0.03), 0.2, DEFAULT_KINDS) is None
 
 
+class OneSurfel(SimpleNamespace):
+    def __len__(self) -> int:
+        return 1
+
+
+def test_points_that_stray_over_a_skirt_are_no_curled_rim() -> None:
+    # regression: of a thin part in mid-print three points in mid-air, far beside it over its skirt,
+    # were the rim of what bends up; a repair had filled all, and the run ended: "warp"
+    rng, size = np.random.default_rng(0), np.array([10.0, 12.0, 0.9])
+    skirt = Manifold.cube((34.0, 36.0, 0.2)) - Manifold.cube((32.0, 34.0, 1.0)).translate((1, 1, 0))
+    vertices, faces = mesh_of(Manifold.cube(tuple(size)) + skirt.translate((-12, -12, 0)))
+    both = MeshSdf.from_mesh(trimesh.Trimesh(vertices, faces))
+    top = np.column_stack([rng.random((4000, 2)) * size[:2], rng.normal(0.9, 0.03, 4000)])
+    points = np.concatenate([top, [[-11.5, -8.0, 1.0], [21.5, 5.0, 1.2], [21.5, 20.0, 1.1]]])
+    seen = SimpleNamespace(
+        points_mm=points, deviation_mm=both.distance(points),
+        evidence=SimpleNamespace(surfels=OneSurfel(spread_mm=0.03, spacing_mm=0.17)),
+    )  # fmt: skip
+    plan = SimpleNamespace(
+        anomaly=seen, scan=SimpleNamespace(sigma_mm=0.03),
+        build_from_template=Transform.identity("build", "template"),
+    )  # fmt: skip
+    found = kinds._surfaces(plan, both, DEFAULT_KINDS)  # type: ignore[arg-type]
+    assert found is not None
+    assert len(found[0]) > 1000
+    assert kinds._warped(found[0], 0.2, DEFAULT_KINDS) is None
+
+
 def test_a_curl_is_one() -> None:
     xy = np.random.default_rng(0).uniform(-8.0, 8.0, (4000, 2))
     lifted = 0.6 * (np.hypot(*(xy / 8.0).T) / 2**0.5) ** 2

@@ -112,6 +112,17 @@ def test_a_part_sliced_lying_in_another_way_is_expected_as_it_lies(
     assert np.abs(CutTemplate(expected, 3.0).distance(np.asarray(points))).max() < 0.15
 
 
+def test_a_part_stands_on_its_lowest_point_however_small_that_is() -> None:
+    # regression: the foot was looked for among points of the surface 1 mm apart; of a bumpy one it
+    # was found 0.15 mm too high, so that a clean job was repaired, and given up as clogged
+    cone = m3.Manifold.cylinder(0.15, 0.02, 0.3, 12)
+    part = m3.Manifold.cube((9.0, 6.0, 2.0)).translate((0.0, 0.0, 0.15)) + cone.translate((4, 2, 0))
+    template = MeshSdf.from_mesh(solid_mesh(part))
+    placed = locate_part(job_of(part.translate((90.0, 70.0, 0.0))), template,
+                         layer_height_mm=LAYER_MM)  # fmt: skip
+    assert placed.translation_mm[2] == pytest.approx(0.0, abs=1e-6)
+
+
 @pytest.mark.slow
 def test_every_copy_is_found_in_the_order_in_which_they_are_begun() -> None:
     truths = [pose((0.0, 0.0, turn), x, y) for turn, x, y in
