@@ -17,7 +17,7 @@ from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
 from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import LIFT_COMMANDS, part_of, sentence
+from gcode.hosts.web import LIFT_COMMANDS, number_or_none, part_of, sentence
 from gcode.protocol import events as ev
 
 
@@ -88,9 +88,9 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def temperatures(self) -> Temperatures:
         """Return the temperatures that OctoPrint polls; ask (M105) where it has none yet."""
-        heaters = self._session.status().get("temperature", {})
+        heaters = part_of(self._session.status(), "temperature")
         pairs = {
-            name: (heater.get("actual"), heater.get("target"))
+            name: (number_or_none(heater.get("actual")), number_or_none(heater.get("target")))
             for name, heater in heaters.items()
             if isinstance(heater, dict)
         }
@@ -212,15 +212,23 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     def _job(self, command: dict[str, str], what: str) -> None:
         self._session.web.expect(204, what, "POST", "/api/job", json=command)
 
-    def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
-        if self._open is None:
-            return
+    def _cancel(self) -> bool:
+        self._refuse_anothers()
         answer = self._session.web.request("POST", "/api/job", json={"command": "cancel"})
         if answer.status_code == 204:
             self._await_rest()
-        self.heaters_off()
+        elif answer.status_code != 409:  # else it prints nothing
+            raise LinkError(f"{self.address.name} does not cancel it ({sentence(answer)}).")
+        return True
+
+    def _lift(self) -> None:
         self._session.command(*LIFT_COMMANDS)
+
+    def _refuse_anothers(self) -> None:
+        flags = self._session.status()["state"]["flags"]
+        name, _ = self._session.printing()
+        if any(flags.get(f) for f in BUSY_STATES) and name != self._session.state.file:
+            raise self._anothers(name)
 
     def _await_rest(self) -> None:
         until_s = self._clock() + self._timing.answer_s
@@ -240,6 +248,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def heaters_off(self) -> None:
         """Switch every hotend, bed and fan off, acknowledged."""
+        self._cools_ours()
         self._session.ask(*SAFE_COMMANDS)
         heads = 0
         with contextlib.suppress(LinkError):  # it reports no temperature
