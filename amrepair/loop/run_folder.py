@@ -16,6 +16,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
@@ -148,13 +149,13 @@ class Setting:
     @property
     def placed(self) -> Transform:
         """Build from template."""
-        return Transform("build", "template", np.array(self.build_from_template, float))
+        return Transform("build", "template", _matrix(self.build_from_template))
 
     def as_it_stands(self, templates: Sequence[Template]) -> Template:
         """What the run looks with: the part's template, or all parts as they stand."""
         if not self.copies:
             return templates[0]
-        poses = (Transform("build", "template", np.array(rows, float)) for rows in self.copies)
+        poses = (Transform("build", "template", _matrix(rows)) for rows in self.copies)
         which = self.parts or (0,) * len(self.copies)
         return StoodTemplate.of_parts(tuple(templates[k] for k in which), tuple(poses))
 
@@ -162,7 +163,7 @@ class Setting:
     def scanner_pose(self) -> Transform:
         """Build from scanner; from the printer's own axes where its probe touches."""
         frame = PROBE if self.scanner == PROBE else "scanner"
-        return Transform("build", frame, np.array(self.build_from_scanner, float))
+        return Transform("build", frame, _matrix(self.build_from_scanner))
 
     def setup(self) -> PrintSetup:
         """The profiles, which must not have changed.
@@ -317,6 +318,13 @@ def forget(folder: Path) -> None:
 def _whole(name: str) -> str:
     """A profile's name; a path is kept from wherever it is read again."""
     return str(Path(name).resolve()) if name.endswith(".toml") or "/" in name else name
+
+
+def _matrix(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.array(rows, float)
+    if matrix.shape != (4, 4):
+        raise ValueError("a pose is no matrix of 4 × 4")
+    return matrix
 
 
 def _rows(transform: Transform) -> tuple[tuple[float, ...], ...]:
