@@ -170,8 +170,7 @@ def _printed(
             )
     except KeyboardInterrupt:
         console.errors.print(
-            "The heaters were told to switch off. When somebody has looked, go on with: "
-            + to_resume(begun.folder.path)
+            f"When somebody has looked, go on with: {to_resume(begun.folder.path)}"
         )
         raise
     except (ScannerError, LinkError) as error:
