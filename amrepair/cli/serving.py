@@ -193,6 +193,9 @@ class _Service:
                 self._talk.say(f"{job.name} is printed without looks: {error}", wrong=True)
             else:
                 self._ended(f"{error}", found[0])
+        finally:
+            if found is not None:
+                found[0].tape.close()
 
     def _begin(self, job: UnderWay) -> tuple[Begun, bool, Stopwatch] | None:
         """A new run, or the one that was begun; None where that was ended."""
@@ -215,9 +218,13 @@ class _Service:
                 told.calibration, watch, AtDesk(self._talk), port=self._told.address.spec,
                 leave_heaters=True, **told.said,
             )  # fmt: skip
-        self._machine.serve(begun.checked)
-        if not events:
-            self._machine.forget_steps()
+        try:
+            self._machine.serve(begun.checked)
+            if not events:
+                self._machine.forget_steps()
+        except BaseException:
+            begun.tape.close()
+            raise
         count = len(begun.stops)
         looks = f"{count} look{'s' if count > 1 else ''}"
         self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")

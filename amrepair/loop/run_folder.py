@@ -309,8 +309,8 @@ def _kept_template(folder: Path, number: int) -> Template:
 
 
 def forget(folder: Path) -> None:
-    """Take an earlier run's record out of a folder that a new run is to have."""
-    for pattern in ("run.json*", "scan-*.ply", "repair-*.gcode", "deficit-*.stl"):
+    """Take an earlier run's record out of a folder that a new run is to have, but for its tape."""
+    for pattern in ("run.json", "scan-*.ply", "repair-*.gcode", "deficit-*.stl"):
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)
 

@@ -142,6 +142,10 @@ def test_a_moved_nozzle_a_cold_bed_free_motors_and_a_long_rest_are_refused(
     late = octo.prints[octo.file]["last"]["date"] + 500.0
     with pytest.raises(ResumeRefusedError, match="has rested for 5"):
         gone_on(printer_at(octo), wall_clock=lambda: late)
+    octo.file = left_there(octo)
+    octo.finish()
+    with pytest.raises(ResumeRefusedError, match="has rested for a time no clock tells"):
+        gone_on(printer_at(octo), wall_clock=lambda: late - 1000.0)  # regression: 0 s
     left_there(octo)
     octo.prints[octo.file] = {"success": 1, "last": {"success": True}}
     octo.files = {octo.file: octo.files.popitem()[1]}
