@@ -289,3 +289,27 @@ def test_a_printer_that_refuses_us_is_not_ours_to_abort(
     with pytest.raises(LinkError, match="another job"):
         send(job, port="octoprint+http://nowhere", printer="generic_marlin")
     assert machine.aborted == 0
+
+
+def test_who_will_not_wait_for_the_safe_exit_leaves_it_to_the_supervisor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Regression: a third Ctrl+C sent the supervisor home with a farewell, and the heaters on."""
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port)
+        printer.connect()
+        printer.command("M104 S100")
+        monkeypatch.setattr(printer, "_comes_to_rest", interrupted)
+        monkeypatch.setattr(printer, "_go_past", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            printer.make_safe()
+        helper = printer._supervisor
+        assert helper is not None
+        printer.close()
+        helper._process.wait(20)
+        assert emulator.state()["hotend_target_c"] == 0
+    assert "the supervisor goes on with it" in printer.notes[-1]
