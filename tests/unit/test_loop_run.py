@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import loop_bench
 import numpy as np
@@ -18,6 +20,7 @@ from amrepair.policy.limits import exceeded
 from amrepair.repair import Site
 from amrepair.scans import Scan
 from gcode.errors import LinkError
+from gcode.hosts.port import PrintReport
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import read_job
@@ -208,6 +211,29 @@ def test_a_run_that_is_interrupted_leaves_the_printer_safe_whatever_it_is_at(
         small.run(tmp_path, silent)
     # on a cable before anybody waits, and at the end, where a link that is safe does nothing more
     assert told == (["safe", "safe"] if on_a_cable else ["heaters off"])
+
+
+@pytest.mark.parametrize(("nth", "kind"), [(2, "park"), (3, "repair"), (4, "back")])
+def test_who_cancels_at_the_printer_ends_the_run_whatever_is_printed(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nth: int, kind: str
+) -> None:
+    """Regression: cancelled in a repair or on a way, the run looked again and printed on."""
+    prints, plain = list[PrintReport](), Thermal.print
+
+    def cancelled(printer: Thermal, *given: Any, **named: Any) -> PrintReport:
+        report = plain(printer, *given, **named)
+        prints.append(replace(report, ok=len(prints) + 1 != nth))
+        return prints[-1]
+
+    monkeypatch.setattr(Thermal, "print", cancelled)
+    pocket = small.block(-0.6, 0.5)
+    with pytest.raises(LoopError, match=f"^the {kind} was stopped at its line"):
+        small.run(
+            tmp_path,
+            lambda n: scan_of(small.standing - pocket if n == 1 else small.standing),
+            limits=small.setup.process,
+        )
+    assert len(prints) == nth
 
 
 def test_an_interrupt_waits_for_nothing_that_is_made_beside_the_print(
