@@ -114,6 +114,7 @@ class GuardedConversation(SerialConversation):
             if self._half_safe:
                 self._told_safe("the safe exit was interrupted; the supervisor goes on with it")
                 self._supervisor.take_over()
+                self._lock.hand_over()
             else:
                 self._supervisor.stand_down()
             self._supervisor, self._half_safe = None, False

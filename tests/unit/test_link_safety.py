@@ -18,7 +18,7 @@ from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
 from gcode.cli.sending import send
-from gcode.errors import JournalError, JournalFileError, LinkError
+from gcode.errors import JournalError, JournalFileError, LinkError, PortBusyError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor
 from gcode.hosts.journal import Journal
@@ -310,6 +310,8 @@ def test_who_will_not_wait_for_the_safe_exit_leaves_it_to_the_supervisor(
         helper = printer._supervisor
         assert helper is not None
         printer.close()
+        with pytest.raises(PortBusyError):  # as long as the supervisor is at it
+            SerialPrinter(emulator.port).connect()
         helper._process.wait(20)
         assert emulator.state()["hotend_target_c"] == 0
     assert "the supervisor goes on with it" in printer.notes[-1]
