@@ -35,7 +35,7 @@ from gcode.hosts.octoprint_job import OctoPrintJob
 from gcode.hosts.port import PullsAtRest, TellsTouches
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.served_job import ServedJob, UnderWay
-from gcode.hosts.web import Address
+from gcode.hosts.web import Address, heaters_word
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
 from gcode.resumption.head import state_at_rest
 from gcode.solids import SOLID_SUFFIXES
@@ -282,7 +282,10 @@ class _Service:
         except LinkError:
             return
         self._talk.prompt(
-            [f"No more looks at this print: {why}", "It rests; heaters are off."],
+            [
+                f"No more looks at this print: {why}",
+                f"It rests. {heaters_word(self._machine.temperatures)}",
+            ],
             [
                 Button("Heat and go on", {"what": "go on"}, "warning"),
                 Button("Cancel the print", {"what": "cancel"}, "error"),

@@ -202,9 +202,10 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
     (bench.folder / "gcodes" / "small_pla.gcode").write_text(twice.text)
     moved = bench.ready.whole.translate((6.0, 0.0, 0.0))
     bench.scans = [scan_of(moved), scan_of(moved)]
-    ended: list[str] = []
+    ended, said = list[str](), list[str]()
 
     def press(text: str) -> None:
+        said.append(text)
         if "footer_button Cancel the print" in text:
             heat = bench.klipper.modes
             ended.append(f"{heat.hotend_c:g} {heat.bed_c:g} {bench.klipper.print_state}")
@@ -215,6 +216,7 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
     bench.answers = press
     assert bench.agent() == 4
     assert ended == ["0 0 paused"], "heaters are off and the print rests"
+    assert any("It rests. Heaters are off." in text for text in said)
     assert "no more looks at this print" in bench.told()
     assert bench.klipper.print_state == "complete", "somebody let it go on"
     back = bench.executed()[bench.executed().index("M140 S0") :]
