@@ -229,9 +229,30 @@ def test_a_question_is_answered_once_and_a_run_is_stopped(
     assert fleet.do("b", "stop")
     until(fleet, lambda: fleet.told()[1]["state"] == RunState.STOPPED)
     assert (tmp_path / "out" / "b" / "heaters").read_text() == "off"
+    told = fleet.told()[1]["sentence"]
+    assert told == "stopped; nothing was said of its heaters: see that they are off"
     fleet.end()
     assert states(fleet) == [RunState.STOPPED, RunState.STOPPED]
     assert (tmp_path / "out" / "a" / "heaters").read_text() == "off"
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_is_said_of_heaters_is_what_the_run_said_last(
+    tmp_path: Path, ended: list[Fleet]
+) -> None:
+    """Regression: a run that was stopped, or died, had its 'heaters off' whatever it had said."""
+    bodies = {
+        "off": "print('printer: heaters off (the printer reports targets of 0)', file=sys.stderr)",
+        "lost": "print('printer: HEATERS COULD NOT BE REACHED (x)', file=sys.stderr)",
+    }
+    fleet = fleet_of(
+        tmp_path, "off lost", fake(lambda spec: bodies[spec.name] + "; sys.exit(130)")
+    )  # fmt: skip
+    ended.append(fleet)
+    until(fleet, lambda: fleet.over)
+    rows = {row["name"]: row["sentence"] for row in fleet.told()}
+    assert rows["off"] == "stopped; heaters off (the printer reports targets of 0)"
+    assert rows["lost"] == "stopped; HEATERS COULD NOT BE REACHED (x)"
 
 
 def test_a_stuck_question_ends_its_run(tmp_path: Path, ended: list[Fleet]) -> None:
