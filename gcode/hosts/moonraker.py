@@ -224,7 +224,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
             return False  # a Klipper that shut down has switched everything off
         if self._session.state.busy:
             self._aborted = True
-            self._session.call("printer.print.cancel", limit_s=None)
+            self._session.call("printer.print.cancel", limit_s=self._timing.lost_s)
         return True
 
     def _lift(self) -> None:
@@ -250,7 +250,9 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
     def heaters_off(self) -> None:
         """Switch every heater and the fan off."""
         self._cools_ours()
-        self.command("TURN_OFF_HEATERS\nM107")
+        script = {"script": "TURN_OFF_HEATERS\nM107"}
+        # It waits its turn behind what heats or moves: who would be safe is told if that is long.
+        self._session.call("printer.gcode.script", script, limit_s=self._timing.lost_s)
 
 
 def _warmth(heater: dict[str, Any]) -> tuple[float | None, float]:

@@ -91,6 +91,22 @@ def test_a_klipper_whose_cancel_macro_fails_is_cooled_all_the_same(
     assert "Move out of range" in caplog.text
 
 
+@pytest.mark.parametrize("silent", ["printer.print.cancel", "printer.gcode.script"])
+def test_a_klipper_that_heats_on_for_minutes_is_told_of(
+    moonraker: FakeMoonraker, caplog: pytest.LogCaptureFixture, silent: str
+) -> None:
+    """Regression: who pressed Ctrl+C while it heated waited without a word until that was over."""
+    plain = moonraker.called
+    moonraker.server.on_message = lambda message: (
+        None if message["method"] == silent else plain(message)
+    )
+    with moonraker_at(moonraker) as printer, pytest.raises(KeyboardInterrupt):
+        printer.print(JOB, progress=interrupt)
+    assert f"is silent for 0.4 s while {silent} was under way" in caplog.text
+    loud = "BUT ITS PRINT GOES ON" if "cancel" in silent else "HEATERS COULD NOT BE REACHED"
+    assert loud in caplog.text
+
+
 def test_anothers_print_is_neither_cancelled_nor_cooled(
     octoprint: FakeOctoPrint, moonraker: FakeMoonraker
 ) -> None:
