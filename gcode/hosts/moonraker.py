@@ -40,14 +40,14 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         mine = [r for r in rows if str(r.get("path")).startswith(prefix)]
         if not mine:
             return None
-        name = str(max(mine, key=lambda row: row.get("modified") or 0)["path"])
+        name = str(max(mine, key=lambda row: number_or_none(row.get("modified")) or 0.0)["path"])
         session.look()
         if state.print_file == name and state.busy:
             return Left(name, "printing")
         if state.print_file == name and state.print_state in MOONRAKER_ENDS:
             return Left(name, "done" if state.print_state == "complete" else "failed")
-        (about,) = session.listed("/server/files/metadata", filename=name)
-        if about.get("print_start_time") is None:
+        about = session.listed("/server/files/metadata", filename=name)
+        if about and all(row.get("print_start_time") is None for row in about):
             return Left(name, "waiting")
         return Left(name, "failed")  # it was begun, and Klipper has done something else since
 
@@ -77,7 +77,8 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         info = self._session.call("printer.info")
         version = info.get("software_version", "") if isinstance(info, dict) else ""
         found = self._session.call("printer.objects.list")
-        objects = found.get("objects", ()) if isinstance(found, dict) else ()
+        objects = found.get("objects") if isinstance(found, dict) else ()
+        objects = objects if isinstance(objects, list) else []
         caps = {name.upper(): name in objects for name in ("virtual_sdcard", "pause_resume")}
         configured = self._session.query({"configfile": ["settings"]}).get("configfile", {})
         if settings := configured.get("settings"):

@@ -45,10 +45,11 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def _left(self, prefix: str) -> Left | None:
         rows = self._session.web.get(self.files).get("files")
-        mine = [r for r in rows or () if str(r.get("path")).startswith(prefix)]
+        rows = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        mine = [row for row in rows if str(row.get("path")).startswith(prefix)]
         if not mine:
             return None
-        newest = max(mine, key=lambda row: row.get("date") or 0)
+        newest = max(mine, key=lambda row: number_or_none(row.get("date")) or 0.0)
         name = str(newest["path"])
         flags = self._session.status()["state"]["flags"]
         if self._session.printing()[0] == name and any(flags.get(f) for f in BUSY_STATES):
@@ -57,12 +58,8 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         last = part_of(prints, "last")
         if not prints.get("success") and not prints.get("failure"):
             return Left(name, "waiting")
-        ended_s = last.get("date")
-        return Left(
-            name,
-            "done" if last.get("success") else "failed",
-            float(ended_s) if isinstance(ended_s, int | float) else None,
-        )
+        ended_s = number_or_none(last.get("date"))
+        return Left(name, "done" if last.get("success") else "failed", ended_s)
 
     def motors_held(self) -> bool:
         """Taken for granted: OctoPrint does not know."""

@@ -166,3 +166,12 @@ def test_a_moved_nozzle_a_cold_bed_free_motors_and_a_long_rest_are_refused(
     moon.objects["heater_bed"]["target"] = 0.0
     gone_on(moon_printer(moon), pose_confirmed=True)
     assert "M190 S60" in moon.scripts  # somebody has looked: it is heated again
+
+
+@pytest.mark.parametrize(
+    "rows", [None, 3, "x", [None, 3], [{"path": None}], [{"path": "amrepair", "date": "now"}]]
+)
+def test_a_list_of_files_that_is_none_names_no_part(octo: FakeOctoPrint, rows: object) -> None:
+    octo.refuse["GET", "/api/files/local"] = (200, {"files": rows})
+    with printer_at(octo) as printer:
+        assert printer._left("gcode-") is None
