@@ -43,6 +43,8 @@ the pause's last move ended before it was counted."""
 BATCH_LINES = 500
 """Lines made ready, and counted, at a time."""
 
+TOUCHES_STOPPED = "The touches were stopped; the nozzle was lifted and the heaters are off."
+
 
 class SerialPrinter(GuardedConversation):
     """A printer behind a serial port.
@@ -304,9 +306,7 @@ class SerialPrinter(GuardedConversation):
             self._forget_z()
             raise NothingMetError(f"{error}") from error
         if not report.ok:
-            raise PrinterError(
-                "The touches were stopped; the nozzle was lifted and the heaters are off."
-            )
+            raise PrinterError(TOUCHES_STOPPED)
         if any(command in text for text in report.warnings):
             self.make_safe()
             how = (
