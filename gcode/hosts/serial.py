@@ -137,6 +137,9 @@ class SerialPrinter(GuardedConversation):
             self._book.lost()
             self.make_safe()
             raise
+        except KeyboardInterrupt:  # not every caller has a `with` around it
+            self.make_safe()
+            raise
         finally:
             self._printing = False
             if self._log is not None:

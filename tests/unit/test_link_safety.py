@@ -315,3 +315,22 @@ def test_who_will_not_wait_for_the_safe_exit_leaves_it_to_the_supervisor(
         helper._process.wait(20)
         assert emulator.state()["hotend_target_c"] == 0
     assert "the supervisor goes on with it" in printer.notes[-1]
+
+
+def test_an_interrupted_print_is_safe_whoever_called_it() -> None:
+    """Regression: without a `with` around it, closing let go of a hot printer."""
+
+    def interrupted(stage: str, done: float, total: float) -> None:
+        if done > 0:
+            raise KeyboardInterrupt
+
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        printer.command("M104 S100")
+        with pytest.raises(KeyboardInterrupt):
+            printer.print(program(moves(2000)), progress=interrupted)
+        state = emulator.state()
+        printer.close()
+    assert state["hotend_target_c"] == 0
+    assert "heaters off" in printer.notes[-1]
