@@ -105,6 +105,18 @@ def test_a_question_waits_for_its_own_answer(tmp_path: Path) -> None:
     assert note["question"] is None
 
 
+def test_a_clock_that_is_set_back_silences_no_desk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: until the clock was where it had been, nobody heard how far the print was."""
+    desk = Desk(tmp_path)
+    desk.progress("print", 1.0, 10.0)
+    now_s = time.time() - 3600.0
+    monkeypatch.setattr("time.time", lambda: now_s)
+    desk.progress("print", 2.0, 10.0)
+    assert (read_note(tmp_path / STATUS) or {})["done"] == 2.0
+
+
 def test_nobody_answers_where_the_supervisor_has_gone(tmp_path: Path) -> None:
     parents = iter([10, 10, 1])
     desk = Desk(tmp_path, sleep=lambda _: None, parent=lambda: next(parents))
