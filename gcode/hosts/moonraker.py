@@ -236,7 +236,7 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
     def _refuse_anothers(self) -> None:
         self._session.look()
         state = self._session.state
-        if state.busy and state.print_file != state.file:
+        if state.busy and state.print_file not in {"", state.file}:
             raise self._anothers(state.print_file)
 
     def emergency_stop(self) -> None:

@@ -224,7 +224,8 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     def _refuse_anothers(self) -> None:
         flags = self._session.status()["state"]["flags"]
         name, _ = self._session.printing()
-        if any(flags.get(f) for f in BUSY_STATES) and name != self._session.state.file:
+        ours = name in {self._session.state.file, "None", ""}  # what nobody names passes for ours
+        if any(flags.get(f) for f in BUSY_STATES) and not ours:
             raise self._anothers(name)
 
     def _await_rest(self) -> None:

@@ -195,3 +195,17 @@ def test_a_print_whose_start_is_not_confirmed_is_cancelled(octoprint: FakeOctoPr
         printer.print(JOB)
     assert octoprint.text == "Operational"
     assert octoprint.commands[:3] == OFF
+
+
+def test_a_print_that_nobody_names_is_cooled(
+    octoprint: FakeOctoPrint, moonraker: FakeMoonraker
+) -> None:
+    """Where a server does not say what it prints, it is taken for ours: hot is the worse error."""
+    with octoprint_at(octoprint) as printer:
+        octoprint.file, octoprint.flags = "", {"operational": True, "cancelling": True}
+        printer.heaters_off()
+    assert octoprint.commands[:3] == OFF
+    with moonraker_at(moonraker) as klipper:
+        moonraker.stats(state="printing", filename="")
+        klipper.heaters_off()
+    assert moonraker.scripts == ["TURN_OFF_HEATERS\nM107"]
