@@ -224,7 +224,8 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     def _refuse_anothers(self) -> None:
         flags = self._session.status()["state"]["flags"]
         name, _ = self._session.printing()
-        ours = name in {self._session.state.file, "None", ""}  # what nobody names passes for ours
+        our_file = self._session.state.file.rpartition("/")[2]  # a name has no folder
+        ours = name in {our_file, "None", ""}  # what nobody names passes for ours
         if any(flags.get(f) for f in BUSY_STATES) and not ours:
             raise self._anothers(name)
 
