@@ -222,12 +222,12 @@ class _Service:
             self._machine.serve(begun.checked)
             if not events:
                 self._machine.forget_steps()
+            count = len(begun.stops)
+            looks = f"{count} look{'s' if count > 1 else ''}"
+            self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")
         except BaseException:
-            begun.tape.close()
+            begun.tape.close()  # whoever goes on with it, this process too, is alone at it
             raise
-        count = len(begun.stops)
-        looks = f"{count} look{'s' if count > 1 else ''}"
-        self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")
         return begun, bool(events), watch
 
     def _part_of(self, name: str) -> Path:
