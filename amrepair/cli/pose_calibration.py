@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from amrepair.cli.scanners import Bed, open_scanner
-from amrepair.errors import InputError
+from amrepair.errors import InputError, LoopError
 from amrepair.frames import Transform
 from amrepair.loop.calibrate import CalibrateOptions, calibrate, target_solid, write_calibration
+from amrepair.loop.safe_exit import leave_safe
 from amrepair.scans import Scan, ScanRequest, read_scan
 from amrepair.template import MeshSdf, PlannedSdf
 from amrepair.template.port import Template
@@ -19,6 +20,7 @@ from gcode.cli import console
 from gcode.cli.options import job_of
 from gcode.hosts import connect
 from gcode.hosts.journal import default_path
+from gcode.hosts.port import Printer
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, load_setup
 from gcode.slicing.job import plan_part
@@ -128,8 +130,20 @@ def _scan(setup: PrintSetup, source: Source, bars: console.Bars) -> Scan:
     with bars.stage("connect"):
         machine.connect()
     try:
-        machine.print(checked, progress=bars)
-        machine.finish_moves()
+        _print_target(machine, checked, bars)
         return eye.scan(ScanRequest("target", None, float(setup.process.layer_height_mm)))
     finally:
         machine.close()
+
+
+def _print_target(machine: Printer, checked: CheckedProgram, bars: console.Bars) -> None:
+    """Print it to its end, or leave the printer safe."""
+    try:
+        with console.interrupts_as_such():
+            report = machine.print(checked, progress=bars)
+            machine.finish_moves()
+        if not report.ok:
+            raise LoopError("the target was stopped at the printer; print it anew")
+    except BaseException:
+        leave_safe(machine)
+        raise

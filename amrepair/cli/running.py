@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -170,8 +170,7 @@ def _printed(
             )
     except KeyboardInterrupt:
         console.errors.print(
-            "The heaters were told to switch off. When somebody has looked, go on with: "
-            + to_resume(begun.folder.path)
+            f"When somebody has looked, go on with: {to_resume(begun.folder.path)}"
         )
         raise
     except (ScannerError, LinkError) as error:
@@ -180,6 +179,7 @@ def _printed(
             console.errors.print(f"When that is mended, go on with: {to_resume(begun.folder.path)}")
         raise
     finally:
+        begun.tape.close()
         machine.close()
 
 
@@ -260,9 +260,14 @@ def new_run(
         scan_unit=unit, adaptive=pace, marked=looks.marked,
         limited=said["approve"] == "auto", title=job_file.name, **said,
     )  # fmt: skip
-    forget(out)
-    keep(out, setting, job.program.text, *(fields[which] for which in used))
-    return Begun(setting, setup, job, expected, stops, folder, checked, Tape(out))
+    tape = Tape(out)
+    tape.hold(anew=True)
+    with ExitStack() as where_it_fails:
+        where_it_fails.callback(tape.close)
+        forget(out)
+        keep(out, setting, job.program.text, *(fields[which] for which in used))
+        where_it_fails.pop_all()
+    return Begun(setting, setup, job, expected, stops, folder, checked, tape)
 
 
 def _how_it_stands(found: Sequence[Located], names: Sequence[str], *, in_turn: bool) -> str:

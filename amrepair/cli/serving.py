@@ -35,7 +35,7 @@ from gcode.hosts.octoprint_job import OctoPrintJob
 from gcode.hosts.port import PullsAtRest, TellsTouches
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.served_job import ServedJob, UnderWay
-from gcode.hosts.web import Address
+from gcode.hosts.web import Address, heaters_word
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, load_setup
 from gcode.resumption.head import state_at_rest
 from gcode.solids import SOLID_SUFFIXES
@@ -193,6 +193,9 @@ class _Service:
                 self._talk.say(f"{job.name} is printed without looks: {error}", wrong=True)
             else:
                 self._ended(f"{error}", found[0])
+        finally:
+            if found is not None:
+                found[0].tape.close()
 
     def _begin(self, job: UnderWay) -> tuple[Begun, bool, Stopwatch] | None:
         """A new run, or the one that was begun; None where that was ended."""
@@ -215,12 +218,16 @@ class _Service:
                 told.calibration, watch, AtDesk(self._talk), port=self._told.address.spec,
                 leave_heaters=True, **told.said,
             )  # fmt: skip
-        self._machine.serve(begun.checked)
-        if not events:
-            self._machine.forget_steps()
-        count = len(begun.stops)
-        looks = f"{count} look{'s' if count > 1 else ''}"
-        self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")
+        try:
+            self._machine.serve(begun.checked)
+            if not events:
+                self._machine.forget_steps()
+            count = len(begun.stops)
+            looks = f"{count} look{'s' if count > 1 else ''}"
+            self._talk.say(f"{job.name} is {'gone on with' if events else 'followed'}: {looks}.")
+        except BaseException:
+            begun.tape.close()  # whoever goes on with it, this process too, is alone at it
+            raise
         return begun, bool(events), watch
 
     def _part_of(self, name: str) -> Path:
@@ -275,7 +282,10 @@ class _Service:
         except LinkError:
             return
         self._talk.prompt(
-            [f"No more looks at this print: {why}", "It rests; heaters are off."],
+            [
+                f"No more looks at this print: {why}",
+                f"It rests. {heaters_word(self._machine.temperatures)}",
+            ],
             [
                 Button("Heat and go on", {"what": "go on"}, "warning"),
                 Button("Cancel the print", {"what": "cancel"}, "error"),

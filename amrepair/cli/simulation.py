@@ -184,6 +184,8 @@ def _recorded(
     from amrepair.loop import Tape
     from amrepair.loop.run_folder import Setting, forget, keep
 
+    tape = Tape(folder.path)
+    tape.hold(anew=True)
     forget(folder.path)
     setting = Setting.of(
         run.setup,
@@ -197,7 +199,7 @@ def _recorded(
         scanner=scanner,
     )
     keep(folder.path, setting, run.checked.program.text, run.template)
-    return Tape(folder.path)
+    return tape
 
 
 def _result(

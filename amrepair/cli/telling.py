@@ -88,7 +88,7 @@ def tell(begun: Begun, report: LoopReport, result: dict[str, Any], *, as_json: b
         console.out.print(f"Report: {folder.file('report.html')}")
     if report.stopped:
         console.errors.print(
-            f"The run was ended ({report.stopped}): parked, heaters off. When somebody has looked: "
+            f"The run was ended ({report.stopped}): parked. When somebody has looked: "
             f"{to_resume(folder.path)} --approve ask"
         )
     if code := exit_code_of(report):

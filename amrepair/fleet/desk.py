@@ -56,7 +56,7 @@ class Desk:
         """Say how far it is."""
         new_stage = stage != self._said["stage"]
         self._said |= {"stage": stage, "done": done, "total": total}
-        if new_stage or time.time() - self._told_s >= TELL_S:
+        if new_stage or abs(time.time() - self._told_s) >= TELL_S:  # a clock may be set back
             self._tell()
 
     def ask(self, question: str, lines: Sequence[str]) -> bool:

@@ -33,7 +33,8 @@ from gcode.process import one_thread
 BACK_OFF_S = 2.0
 # How long a process may take to lift the nozzle, switch heaters off and end.
 END_S = 90.0
-DESK = "desk"
+DESK, LOG = "desk", "loop.log"
+LOG_TAIL_BYTES = 1 << 14  # its last words
 INTERRUPTED = 130
 OWN_ENDS = (0, 2, 3, 4, INTERRUPTED)
 
@@ -82,6 +83,8 @@ class Seat:
         Number of the last question that somebody answered.
     orphan
         Process of an earlier supervisor's that still prints; 0 where there is none.
+    log_bytes
+        Where its log begins that is of the process.
     """
 
     spec: PrinterSpec
@@ -99,6 +102,7 @@ class Seat:
     stopping: bool = False
     killed_at_s: float = 0.0
     answered: int = 0
+    log_bytes: int = 0
 
     def begin(self, now_s: float) -> None:
         """Find out what its folder holds: nothing, a run to go on with, or a run that is over."""
@@ -138,8 +142,9 @@ class Seat:
         command = self.command(self.spec, self.folder, bool(read_events(self.folder)))
         with (
             (self.folder / "loop.out").open("wb") as out,
-            (self.folder / "loop.log").open("ab") as log,
+            (self.folder / LOG).open("ab") as log,
         ):
+            self.log_bytes = log.tell()
             # a session of its own: an interrupt at the terminal is the supervisor's to pass on
             self.process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=out, stderr=log, start_new_session=True,
@@ -167,7 +172,7 @@ class Seat:
         if self.stopping or code == INTERRUPTED:
             self.stopping = False
             self.state = RunState.STOPPED
-            self.sentence = self.sentence or "stopped; heaters off"
+            self.sentence = f"{self.sentence or 'stopped'}; {self._said_of_heaters()}"
         elif code in OWN_ENDS:
             self.state = {0: RunState.DONE, 3: RunState.BEYOND}.get(code, RunState.FAILED)
             self.sentence = why
@@ -182,13 +187,25 @@ class Seat:
             self.state = RunState.FAILED
             self.sentence = (
                 f"its process ended {how}, after {len(self.restarts)} restarts in "
-                f"{self.options.within_s:.0f} s; its heaters were switched off"
+                f"{self.options.within_s:.0f} s; {self._said_of_heaters()}"
             )
             return
         self.restarts.append(now_s)
         self.restarted += 1
         self.state, self.start_at_s = RunState.WAITS, now_s + BACK_OFF_S
         self.sentence = f"its process ended {how}; it is gone on with"
+
+    def _said_of_heaters(self) -> str:
+        """The last that the process told of its printer, since it was started."""
+        with (self.folder / LOG).open("rb") as log:
+            log.seek(max(self.log_bytes, log.seek(0, os.SEEK_END) - LOG_TAIL_BYTES))
+            lines = log.read().decode("utf-8", "replace").splitlines()
+        told = [
+            line for line in lines if line.startswith("printer: ") and "heaters" in line.lower()
+        ]
+        if not told:
+            return "nothing was said of its heaters: see that they are off"
+        return told[-1].removeprefix("printer: ")
 
     def answer(self, number: int, *, yes: bool) -> bool:
         """Answer a question; False where it is not asked any more."""

@@ -6,7 +6,6 @@ it is done, and what the tape has is not done again.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -26,6 +25,7 @@ from amrepair.loop.memory import settled
 from amrepair.loop.next_layer import rewritten_layer
 from amrepair.loop.objects import Course, Objects, is_laid
 from amrepair.loop.options import Approval, LoopOptions, Records
+from amrepair.loop.safe_exit import cool, leave_safe
 from amrepair.loop.sites import Expected
 from amrepair.loop.situation import decide_look
 from amrepair.loop.tape import ANEW, LOOK_EVENTS, TapeEndsError
@@ -36,7 +36,7 @@ from amrepair.repair import RepairPlan, Site, plan_repair
 from amrepair.scans import PROBE, Scan, Scanner, ScanRequest
 from gcode.check import CheckedProgram
 from gcode.errors import GcodeError
-from gcode.hosts.port import GoesOnAnew, LeavesOut, Printer, PrintReport
+from gcode.hosts.port import GoesOnAnew, LeavesOut, MakesSafe, Printer, PrintReport
 from gcode.moves import ModalState
 from gcode.progress import Progress
 from gcode.reader import Job
@@ -118,7 +118,12 @@ class Run:
             settling = beside.submit(self.settle)
             told = self._telling("print", first, end, lines)
             kind, base = ("rest" if self._base else "job"), self._base
-            report = self._wire.send(kind, self._checked, first - base, end - base, told)
+            try:
+                report = self._wire.send(kind, self._checked, first - base, end - base, told)
+            except BaseException:
+                if isinstance(self._printer, MakesSafe):  # a server has seen to it
+                    leave_safe(self._printer)  # before anybody waits for what is made beside it
+                raise
         settling.result()
         if report is not None:
             self._job_prints.append(report)
@@ -143,8 +148,7 @@ class Run:
         if not self._tape.only_read and not (self._tape.peek() and self._tape.next("end")):
             if self._stopped:
                 self._wire.go_live()
-                with contextlib.suppress(GcodeError, OSError):
-                    self._printer.heaters_off()
+                cool(self._printer)
             self._tape.write("end", stopped=self._stopped)
 
     # ------------------------------------------------------------------ a stop

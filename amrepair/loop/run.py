@@ -8,19 +8,18 @@ the tape first. A run that was killed is this same function over its tape.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 
 from amrepair.loop.engine import Run
 from amrepair.loop.looks import LoopReport, Stop
 from amrepair.loop.options import LOOP, UNASKED, Approval, LoopOptions, Records
 from amrepair.loop.pace import Stops, had_trouble
+from amrepair.loop.safe_exit import leave_safe
 from amrepair.loop.tape import TapeEndsError
 from amrepair.repair import Site
 from amrepair.scans import Scanner
 from gcode.check import CheckedProgram
-from gcode.errors import GcodeError
-from gcode.hosts.port import MakesSafe, Printer
+from gcode.hosts.port import Printer
 from gcode.process import gives_back
 from gcode.progress import Progress, silent
 from gcode.reader import Job
@@ -110,16 +109,7 @@ def run_loop(
     except TapeEndsError:
         pass
     except BaseException:
-        _leave_safe(printer)
+        leave_safe(printer)
         raise
     run.settle()
     return run.report()
-
-
-def _leave_safe(printer: Printer) -> None:
-    """Off with the heaters, and on a cable the nozzle up; the failure stays what is told."""
-    with contextlib.suppress(GcodeError, OSError):
-        if isinstance(printer, MakesSafe):
-            printer.make_safe()  # it waits for no heater that is under way
-        else:
-            printer.heaters_off()

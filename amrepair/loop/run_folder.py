@@ -9,11 +9,14 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from amrepair.errors import InputError
 from amrepair.frames import Transform
@@ -35,6 +38,11 @@ from gcode.whole import write_bytes
 
 SETTING, JOB, TEMPLATE, MESH = "run.json", "job.gcode", "template.safetensors", "template.npz"
 RUN_VERSION = 4
+# What comes of files that are cut off, or that hold something else than was written.
+_DAMAGED = (
+    *(ArithmeticError, AttributeError, LookupError, TypeError, ValueError),
+    *(BadZipFile, EOFError),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,13 +149,13 @@ class Setting:
     @property
     def placed(self) -> Transform:
         """Build from template."""
-        return Transform("build", "template", np.array(self.build_from_template))
+        return Transform("build", "template", _matrix(self.build_from_template))
 
     def as_it_stands(self, templates: Sequence[Template]) -> Template:
         """What the run looks with: the part's template, or all parts as they stand."""
         if not self.copies:
             return templates[0]
-        poses = (Transform("build", "template", np.array(rows)) for rows in self.copies)
+        poses = (Transform("build", "template", _matrix(rows)) for rows in self.copies)
         which = self.parts or (0,) * len(self.copies)
         return StoodTemplate.of_parts(tuple(templates[k] for k in which), tuple(poses))
 
@@ -155,7 +163,7 @@ class Setting:
     def scanner_pose(self) -> Transform:
         """Build from scanner; from the printer's own axes where its probe touches."""
         frame = PROBE if self.scanner == PROBE else "scanner"
-        return Transform("build", frame, np.array(self.build_from_scanner))
+        return Transform("build", frame, _matrix(self.build_from_scanner))
 
     def setup(self) -> PrintSetup:
         """The profiles, which must not have changed.
@@ -226,8 +234,8 @@ def open_run(folder: Path) -> Recorded:
         text = (folder / JOB).read_text(encoding="utf-8", errors="replace")
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{folder} is not the folder of a recorded run ({error}); name the one that 'loop' or "
-            "'simulate' wrote"
+            f"{folder} is not the folder of a recorded run ({_lacks(folder, error)}); name the one "
+            "that 'loop' or 'simulate' wrote"
         ) from error
     if not isinstance(said, dict) or said.pop("version", None) != RUN_VERSION:
         raise InputError(
@@ -237,9 +245,19 @@ def open_run(folder: Path) -> Recorded:
     try:
         policy = PolicyOptions(**said.pop("policy"))
         setting = Setting(policy=policy, **{key: as_tuples(value) for key, value in said.items()})
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{folder / SETTING} cannot be read ({in_words(error)})") from error
+        return _opened(folder, setting, text)
+    except _DAMAGED as error:
+        raise InputError(
+            f"the run in {folder} cannot be read ({in_words(error)}); one of its files is damaged, "
+            "or of another version"
+        ) from error
+
+
+def _opened(folder: Path, setting: Setting, text: str) -> Recorded:
+    """What a setting means."""
     setup = setting.setup()
+    setting.options(setup.process)  # what cannot be meant is told now, and not at the first look
+    _ = setting.placed, setting.scanner_pose
     job = job_for(text, setup.printer)
     stops = (
         marked_stops(job, setting.title, start=setting.marked)
@@ -252,6 +270,16 @@ def open_run(folder: Path) -> Recorded:
     return Recorded(setting, setup, job, template, stops)
 
 
+def _lacks(folder: Path, error: Exception) -> str:
+    """Why it is none: a run that was never begun there is the usual case."""
+    if not folder.is_dir():
+        return "there is no such folder"
+    if isinstance(error, FileNotFoundError):
+        name = Path(str(error.filename)).name
+        return f"it has no {name}: no run was begun there, or it was stopped before it began"
+    return str(getattr(error, "strerror", None) or in_words(error))
+
+
 def _keep_template(folder: Path, template: Template, number: int) -> None:
     """As its own file; an exact mesh, which has none, as its triangles."""
     save: Any = getattr(template, "save", None)
@@ -261,8 +289,9 @@ def _keep_template(folder: Path, template: Template, number: int) -> None:
         save(own)
         return
     vertices, faces = mesh_of(template.solid())
-    with mesh.open("wb") as file:
-        np.savez(file, vertices_mm=vertices, faces=faces)
+    packed = BytesIO()
+    np.savez(packed, vertices_mm=vertices, faces=faces)
+    write_bytes(mesh, packed.getvalue())
 
 
 def _numbered(path: Path, number: int) -> Path:
@@ -274,14 +303,14 @@ def _kept_template(folder: Path, number: int) -> Template:
     own = _numbered(folder / MESH, number)
     if not own.is_file():
         return load_template(_numbered(folder / TEMPLATE, number))
-    with np.load(own) as kept:
+    with np.load(BytesIO(own.read_bytes())) as kept:
         mesh = trimesh.Trimesh(kept["vertices_mm"], kept["faces"], process=False)
     return MeshSdf.from_mesh(mesh)
 
 
 def forget(folder: Path) -> None:
-    """Take an earlier run's record out of a folder that a new run is to have."""
-    for pattern in ("run.json*", "scan-*.ply", "repair-*.gcode", "deficit-*.stl"):
+    """Take an earlier run's record out of a folder that a new run is to have, but for its tape."""
+    for pattern in ("run.json", "scan-*.ply", "repair-*.gcode", "deficit-*.stl"):
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)
 
@@ -289,6 +318,13 @@ def forget(folder: Path) -> None:
 def _whole(name: str) -> str:
     """A profile's name; a path is kept from wherever it is read again."""
     return str(Path(name).resolve()) if name.endswith(".toml") or "/" in name else name
+
+
+def _matrix(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.array(rows, float)
+    if matrix.shape != (4, 4):
+        raise ValueError("a pose is no matrix of 4 × 4")
+    return matrix
 
 
 def _rows(transform: Transform) -> tuple[tuple[float, ...], ...]:

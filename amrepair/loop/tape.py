@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from amrepair.errors import InputError, LoopError
 from amrepair.scans import Scan, read_scan
 from gcode.check import CheckedProgram
 from gcode.hosts.port import PrintReport
+from gcode.locks import try_lock
 
 TAPE = "run.jsonl"
 LOOK_EVENTS = ("look", "no_look")
@@ -135,33 +137,62 @@ class Tape:
         Raises
         ------
         InputError
-            If it was printed to its end, or nothing was recorded.
+            If it was printed to its end, nothing was recorded, or another command is at it.
         """
         if not self._events:
             raise InputError(f"{self.path} has no record of a run; name the folder of one")
+        self.hold()
         last = self._events[-1]
         if last.get("event") != "end":
             return
         if not last.get("stopped"):
+            self.close()
             raise InputError(
                 f"the run in {self.path} was printed to its end; there is nothing left"
             )
         self.write("reopened")
         self._events = _before_the_end(self._events)
 
+    def hold(self, *, anew: bool = False) -> None:
+        """Keep the record for this run alone until it is closed; `anew`: what it has is forgotten.
+
+        Raises
+        ------
+        InputError
+            If another command is at this run: two would send what each of them alone remembers.
+        LoopError
+            If it cannot be written.
+        """
+        if self.path is None or self.only_read or self._fd is not None:
+            return
+        with self._told():
+            self._fd = self._open(self.path / TAPE)
+            if anew:
+                os.ftruncate(self._fd, 0)
+        self._events = [] if anew else read_events(self.path)
+
     def write(self, event: str, **said: Any) -> None:
         """Put an event on the disk."""
         if self.path is None or self.only_read:
             return
         line = json.dumps({"event": event, "time_s": round(self._clock(), 3), **said})
-        try:
+        with self._told():
             if self._fd is None:
                 self._fd = self._open(self.path / TAPE)
-            os.write(self._fd, line.encode() + b"\n")
+            data = line.encode() + b"\n"
+            while data:  # of a disk that is nearly full the first part is taken without a word
+                data = data[os.write(self._fd, data) :]
             os.fsync(self._fd)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Within it, what the disk refuses is told; half a line is cut off at the next opening."""
+        try:
+            yield
         except OSError as error:
+            self.close()
             raise LoopError(
-                f"the record {self.path / TAPE} cannot be written ({error.strerror}); nothing is "
+                f"the record {self.path}/{TAPE} cannot be written ({error.strerror}); nothing is "
                 "sent that is not on the disk"
             ) from error
 
@@ -169,6 +200,12 @@ class Tape:
         path.parent.mkdir(parents=True, exist_ok=True)
         as_is = getattr(os, "O_BINARY", 0)  # Windows would end lines its own way
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | as_is, 0o644)
+        if not try_lock(fd):
+            os.close(fd)
+            raise InputError(
+                f"another command is at the run in {path.parent}; let it end, or name another "
+                "folder"
+            )
         kept = path.read_bytes()
         if not kept.endswith(b"\n"):  # cut short by a kill
             os.ftruncate(fd, kept.rfind(b"\n") + 1)

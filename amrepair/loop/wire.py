@@ -19,6 +19,8 @@ from gcode.progress import Progress, silent
 
 PickUp = Callable[[Sequence[Sent], Progress], PrintReport | None]
 """Finds out where the printer is, and has it finish what it was sent last, telling how far."""
+OF_THE_JOB = ("job", "rest")
+"""Kinds of what is sent that are the job's own lines: who sends them tells where they ended."""
 
 
 class Wire:
@@ -49,6 +51,11 @@ class Wire:
         """Print lines [first, end) of a program, or find on the tape that they were.
 
         None where the tape is only read, or ends with their last line acknowledged.
+
+        Raises
+        ------
+        LoopError
+            If what is none of the job's own lines was cancelled at the printer.
         """
         if self._tape.only_read:
             return None
@@ -61,6 +68,11 @@ class Wire:
         if report.ok:
             self._printer.finish_moves()
             self._end(report=asdict(report))
+        elif kind not in OF_THE_JOB:
+            raise LoopError(
+                f"the {kind} was stopped at its line {report.next_line + 1} of {end}, by whoever "
+                "is at the printer; heaters were told to switch off"
+            )
         return report
 
     def touch(self, checked: CheckedProgram, told: Callable[[], None]) -> list[float]:

@@ -25,8 +25,11 @@ def covered_mm2(job: Job) -> Float[np.ndarray, " layers"]:
     beads = job.beads
     low = np.minimum(beads.start_mm, beads.end_mm)[:, :2].min(axis=0) - COVER_CELL_MM
     high = np.maximum(beads.start_mm, beads.end_mm)[:, :2].max(axis=0) + COVER_CELL_MM
-    cell_mm = max(COVER_CELL_MM, float(np.sqrt(np.prod(high - low) / MOST_LAYER_CELLS)))
-    nx, ny = (int(v) for v in np.ceil((high - low) / cell_mm))
+    wide_mm = high - low
+    most = MOST_LAYER_CELLS  # a row of cells as well, where a job is one line that leads far away
+    coarser_mm = max(np.sqrt(np.prod(wide_mm) / most), wide_mm.max() / most)
+    cell_mm = max(COVER_CELL_MM, float(coarser_mm))
+    nx, ny = (int(v) for v in np.ceil(wide_mm / cell_mm))
     bounds = np.searchsorted(beads.layer, np.arange(len(job.layers) + 1))
     areas, open_before = np.zeros(len(job.layers)), np.zeros((ny, nx), bool)
     for layer in range(len(job.layers)):

@@ -36,6 +36,7 @@ class GuardedConversation(SerialConversation):
         self._lock = PortLock(line.port)
         self._book = JobBook(self._link, line.journal, line.clock)
         self._safe_after = -1  # bytes sent when it was last made safe
+        self._half_safe = False  # an interrupt, and one more, came in the midst of that
 
     def __exit__(
         self,
@@ -105,10 +106,18 @@ class GuardedConversation(SerialConversation):
         before_hello(number)
 
     def close(self) -> None:
-        """Let go of the printer; heaters stay as they are (`make_safe` switches them off)."""
+        """Let go of the printer; heaters stay as they are (`make_safe` switches them off).
+
+        Where that was begun and not finished, by whoever would not wait, the supervisor does it.
+        """
         if self._supervisor is not None:
-            self._supervisor.stand_down()
-            self._supervisor = None
+            if self._half_safe:
+                self._told_safe("the safe exit was interrupted; the supervisor goes on with it")
+                self._supervisor.take_over()
+                self._lock.hand_over()
+            else:
+                self._supervisor.stand_down()
+            self._supervisor, self._half_safe = None, False
         self._close_port()
         self._lock.release()
 
@@ -145,14 +154,17 @@ class GuardedConversation(SerialConversation):
         if self._serial is None or self._safe_after == self._bytes_sent:
             return
         ours = self._mutex.acquire(timeout=REST_S)  # another thread may print
+        self._half_safe = True
         try:
             if not (ours and self._comes_to_rest() and self._switched_off()):
                 self._go_past()
-            self._safe_after = self._bytes_sent
+            self._safe_after, self._half_safe = self._bytes_sent, False
         except KeyboardInterrupt:  # in the midst of this: once more, past everything
             self._go_past()
+            self._half_safe = False
             raise
         except (LinkError, LocalProtocolError, OSError) as error:
+            self._half_safe = False
             self._told_safe(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
         finally:
             if ours:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import random
 import sqlite3
@@ -32,6 +33,8 @@ JOURNAL_VERSION = 2
 """Of the tables below; a journal of another version is not read."""
 FIRST_BASES = (10_000, 20_000)
 """Range of a new journal's first number: no firmware is there by itself after a reset."""
+CLOCK_SLEW_S = 5.0
+"""A clock that is more behind what was noted was set back: one without a battery, at its start."""
 FOREIGN_LINES = 50_000
 """Most commands of the host's own after a step: a question a second for half a day of pause."""
 
@@ -363,7 +366,8 @@ class Journal:
     def longest_silence_s(self, now_s: float) -> float:
         """Return the longest time without an entry since the latest job's last step, s.
 
-        What a later attempt to go on has noted ends no silence that came before it.
+        Infinite where the clock was set back since: nobody knows how long it was then. What a
+        later attempt to go on has noted ends no silence that came before it.
         """
         rows = self._run(
             "WITH latest AS (SELECT MAX(id) AS id, MAX(started_s) AS begun_s FROM job),"
@@ -375,6 +379,8 @@ class Journal:
             " AND time_s > (SELECT time_s FROM stepped) ORDER BY 1"
         )
         times_s = [row[0] for row in rows if row[0] is not None] or [now_s]
+        if now_s < times_s[-1] - CLOCK_SLEW_S:
+            return math.inf
         return max(b - a for a, b in pairwise([*times_s, max(now_s, times_s[-1])]))
 
     def notes(self) -> tuple[str, ...]:

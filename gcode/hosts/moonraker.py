@@ -9,6 +9,7 @@ its turn).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from gcode.errors import LinkError, PortBusyError, PrinterError
 from gcode.hosts.modes import commands_of
@@ -17,7 +18,7 @@ from gcode.hosts.moonraker_state import MOONRAKER_ENDS, cause_of
 from gcode.hosts.port import Capabilities, LinkLostError, PrintableProgram, Temperatures
 from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import LIFT_COMMANDS, sentence
+from gcode.hosts.web import LIFT_COMMANDS, number_or_none, sentence
 from gcode.progress import Progress
 
 
@@ -39,14 +40,14 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         mine = [r for r in rows if str(r.get("path")).startswith(prefix)]
         if not mine:
             return None
-        name = str(max(mine, key=lambda row: row.get("modified") or 0)["path"])
+        name = str(max(mine, key=lambda row: number_or_none(row.get("modified")) or 0.0)["path"])
         session.look()
         if state.print_file == name and state.busy:
             return Left(name, "printing")
         if state.print_file == name and state.print_state in MOONRAKER_ENDS:
             return Left(name, "done" if state.print_state == "complete" else "failed")
-        (about,) = session.listed("/server/files/metadata", filename=name)
-        if about.get("print_start_time") is None:
+        about = session.listed("/server/files/metadata", filename=name)
+        if about and all(row.get("print_start_time") is None for row in about):
             return Left(name, "waiting")
         return Left(name, "failed")  # it was begun, and Klipper has done something else since
 
@@ -76,7 +77,8 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         info = self._session.call("printer.info")
         version = info.get("software_version", "") if isinstance(info, dict) else ""
         found = self._session.call("printer.objects.list")
-        objects = found.get("objects", ()) if isinstance(found, dict) else ()
+        objects = found.get("objects") if isinstance(found, dict) else ()
+        objects = objects if isinstance(objects, list) else []
         caps = {name.upper(): name in objects for name in ("virtual_sdcard", "pause_resume")}
         configured = self._session.query({"configfile": ["settings"]}).get("configfile", {})
         if settings := configured.get("settings"):
@@ -92,29 +94,37 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
             "heaters": ["available_heaters"],
         }
         status = self._session.query(wanted)
-        there = status.get("heaters", {}).get("available_heaters", ())
+        there = status.get("heaters", {}).get("available_heaters")
+        there = there if isinstance(there, list) else []
         named = ["extruder", *(f"extruder{k}" for k in range(1, len(there)))]
         names = [name for name in named if name in there]
         if len(names) > 1:
             wanted = {name: ["temperature", "target"] for name in names}
             status |= self._session.query(wanted)
         chosen = str(status.get("toolhead", {}).get("extruder") or "extruder")
-        hotend, bed = status.get(chosen, {}), status.get("heater_bed", {})
-        if "temperature" not in hotend:
-            raise LinkError(f"{self.address.name} reports no [extruder]; check printer.cfg.")
+        hotend_c, hotend_target_c = _warmth(status.get(chosen, {}))
+        bed_c, bed_target_c = _warmth(status.get("heater_bed", {}))
+        if hotend_c is None:
+            raise LinkError(
+                f"{self.address.name} reports no temperature of an [extruder]; check printer.cfg."
+            )
         return Temperatures(
-            float(hotend["temperature"]),
-            float(hotend.get("target") or 0.0),
-            float(bed["temperature"]) if "temperature" in bed else None,
-            float(bed.get("target") or 0.0) if "temperature" in bed else None,
-            tuple(float(status[name].get("target") or 0.0) for name in names if len(names) > 1),
+            hotend_c,
+            hotend_target_c,
+            bed_c,
+            None if bed_c is None else bed_target_c,
+            tuple(_warmth(status.get(name, {}))[1] for name in names if len(names) > 1),
         )
 
     def position_mm(self) -> tuple[float, float, float]:
         """Ask for the logical position."""
         place = self._session.query({"gcode_move": ["gcode_position"]}).get("gcode_move", {})
-        x_mm, y_mm, z_mm = (float(value) for value in place["gcode_position"][:3])
-        return x_mm, y_mm, z_mm
+        told = place.get("gcode_position")
+        axes = [number_or_none(value) for value in told[:3]] if isinstance(told, list) else []
+        known = [value for value in axes if value is not None]
+        if len(known) != 3:
+            raise LinkError(f"{self.address.name} does not tell where the nozzle is.")
+        return known[0], known[1], known[2]
 
     def finish_moves(self) -> None:
         """Return when every buffered move has been made (M400)."""
@@ -209,21 +219,25 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
         """Have Klipper go on."""
         self._session.call("printer.print.resume", limit_s=None)
 
-    def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted where homed; harmless unconnected."""
-        if self._open is None:
-            return
-        session = self._session
-        session.look()
-        if session.state.stopped:
-            return  # a Klipper that shut down has switched everything off
-        if session.state.busy:
+    def _cancel(self) -> bool:
+        self._refuse_anothers()
+        if self._session.state.stopped:
+            return False  # a Klipper that shut down has switched everything off
+        if self._session.state.busy:
             self._aborted = True
-            session.call("printer.print.cancel", limit_s=None)
-        self.heaters_off()
-        homed = session.query({"toolhead": ["homed_axes"]}).get("toolhead", {})
+            self._session.call("printer.print.cancel", limit_s=self._timing.lost_s)
+        return True
+
+    def _lift(self) -> None:
+        homed = self._session.query({"toolhead": ["homed_axes"]}).get("toolhead", {})
         if "z" in str(homed.get("homed_axes", "")):
             self.command("\n".join(LIFT_COMMANDS))
+
+    def _refuse_anothers(self) -> None:
+        self._session.look()
+        state = self._session.state
+        if state.busy and state.print_file not in {"", state.file}:
+            raise self._anothers(state.print_file)
 
     def emergency_stop(self) -> None:
         """Stop Klipper now, by its own endpoint; FIRMWARE_RESTART it afterwards."""
@@ -236,7 +250,16 @@ class MoonrakerPrinter(ServerPrinter[MoonrakerSession]):
 
     def heaters_off(self) -> None:
         """Switch every heater and the fan off."""
-        self.command("TURN_OFF_HEATERS\nM107")
+        self._cools_ours()
+        script = {"script": "TURN_OFF_HEATERS\nM107"}
+        # It waits its turn behind what heats or moves: who would be safe is told if that is long.
+        self._session.call("printer.gcode.script", script, limit_s=self._timing.lost_s)
+
+
+def _warmth(heater: dict[str, Any]) -> tuple[float | None, float]:
+    """Temperature of a heater, None where it is not told, and its target, °C."""
+    target_c = number_or_none(heater.get("target"))
+    return number_or_none(heater.get("temperature")), target_c or 0.0
 
 
 def _why(text: str) -> str:

@@ -17,7 +17,7 @@ from gcode.hosts.port import Capabilities, PrintableProgram, Temperatures
 from gcode.hosts.safety import SAFE_COMMANDS
 from gcode.hosts.server import Left, ServerPrinter, ServerReach
 from gcode.hosts.upload import JobFile
-from gcode.hosts.web import LIFT_COMMANDS, part_of, sentence
+from gcode.hosts.web import LIFT_COMMANDS, number_or_none, part_of, sentence
 from gcode.protocol import events as ev
 
 
@@ -45,10 +45,11 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def _left(self, prefix: str) -> Left | None:
         rows = self._session.web.get(self.files).get("files")
-        mine = [r for r in rows or () if str(r.get("path")).startswith(prefix)]
+        rows = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        mine = [row for row in rows if str(row.get("path")).startswith(prefix)]
         if not mine:
             return None
-        newest = max(mine, key=lambda row: row.get("date") or 0)
+        newest = max(mine, key=lambda row: number_or_none(row.get("date")) or 0.0)
         name = str(newest["path"])
         flags = self._session.status()["state"]["flags"]
         if self._session.printing()[0] == name and any(flags.get(f) for f in BUSY_STATES):
@@ -57,12 +58,8 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
         last = part_of(prints, "last")
         if not prints.get("success") and not prints.get("failure"):
             return Left(name, "waiting")
-        ended_s = last.get("date")
-        return Left(
-            name,
-            "done" if last.get("success") else "failed",
-            float(ended_s) if isinstance(ended_s, int | float) else None,
-        )
+        ended_s = number_or_none(last.get("date"))
+        return Left(name, "done" if last.get("success") else "failed", ended_s)
 
     def motors_held(self) -> bool:
         """Taken for granted: OctoPrint does not know."""
@@ -88,9 +85,9 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def temperatures(self) -> Temperatures:
         """Return the temperatures that OctoPrint polls; ask (M105) where it has none yet."""
-        heaters = self._session.status().get("temperature", {})
+        heaters = part_of(self._session.status(), "temperature")
         pairs = {
-            name: (heater.get("actual"), heater.get("target"))
+            name: (number_or_none(heater.get("actual")), number_or_none(heater.get("target")))
             for name, heater in heaters.items()
             if isinstance(heater, dict)
         }
@@ -212,15 +209,25 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
     def _job(self, command: dict[str, str], what: str) -> None:
         self._session.web.expect(204, what, "POST", "/api/job", json=command)
 
-    def abort(self) -> None:
-        """Cancel the print, heaters off, nozzle lifted; harmless when not connected."""
-        if self._open is None:
-            return
+    def _cancel(self) -> bool:
+        self._refuse_anothers()
         answer = self._session.web.request("POST", "/api/job", json={"command": "cancel"})
         if answer.status_code == 204:
             self._await_rest()
-        self.heaters_off()
+        elif answer.status_code != 409:  # else it prints nothing
+            raise LinkError(f"{self.address.name} does not cancel it ({sentence(answer)}).")
+        return True
+
+    def _lift(self) -> None:
         self._session.command(*LIFT_COMMANDS)
+
+    def _refuse_anothers(self) -> None:
+        flags = self._session.status()["state"]["flags"]
+        name, _ = self._session.printing()
+        our_file = self._session.state.file.rpartition("/")[2]  # a name has no folder
+        ours = name in {our_file, "None", ""}  # what nobody names passes for ours
+        if any(flags.get(f) for f in BUSY_STATES) and not ours:
+            raise self._anothers(name)
 
     def _await_rest(self) -> None:
         until_s = self._clock() + self._timing.answer_s
@@ -240,6 +247,7 @@ class OctoPrintPrinter(ServerPrinter[OctoPrintSession]):
 
     def heaters_off(self) -> None:
         """Switch every hotend, bed and fan off, acknowledged."""
+        self._cools_ours()
         self._session.ask(*SAFE_COMMANDS)
         heads = 0
         with contextlib.suppress(LinkError):  # it reports no temperature

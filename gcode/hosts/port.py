@@ -124,6 +124,10 @@ class NothingMetError(PrinterError):
     """A touch went as deep as it may and met nothing; heaters are off, the nozzle is lifted."""
 
 
+class PrintsOnError(LinkError):
+    """Heaters were told to switch off, and the print that heats them could not be cancelled."""
+
+
 class LinesInDoubtError(LinkError):
     """Lines of a program may or may not have been executed; they are named, counted from 0.
 

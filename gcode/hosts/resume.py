@@ -9,6 +9,7 @@ names the interval: the last line known to be executed, the last that can have b
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -285,9 +286,11 @@ class _Resumption:
 
     def _require_motors(self) -> None:
         if self._silence_s > MOTORS_HELD_S:
+            known = math.isfinite(self._silence_s)  # else the clock was set back since
+            long = f"for {self._silence_s:.0f} s" if known else "for a time that no clock tells"
             self._refuse(
-                f"the printer was left alone for {self._silence_s:.0f} s and lets go of its motors "
-                f"after {MOTORS_HELD_S:g} s; confirm by a rescan where the part stands, and say "
+                f"the printer was left alone {long} and lets go of its motors after "
+                f"{MOTORS_HELD_S:g} s; confirm by a rescan where the part stands, and say "
                 f"--pose-confirmed"
             )
 

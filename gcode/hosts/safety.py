@@ -55,6 +55,10 @@ class Supervisor:
         os.close(ours)
         self._pipe = theirs
 
+    def take_over(self) -> None:
+        """Without a farewell: make the printer safe, whatever becomes of us; waits for nothing."""
+        os.close(self._pipe)
+
     def stand_down(self) -> None:
         """Say farewell: the sender ends in order, nothing is to be done."""
         with contextlib.suppress(OSError):

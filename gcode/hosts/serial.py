@@ -43,6 +43,8 @@ the pause's last move ended before it was counted."""
 BATCH_LINES = 500
 """Lines made ready, and counted, at a time."""
 
+TOUCHES_STOPPED = "The touches were stopped; the nozzle was lifted and the heaters are off."
+
 
 class SerialPrinter(GuardedConversation):
     """A printer behind a serial port.
@@ -133,6 +135,9 @@ class SerialPrinter(GuardedConversation):
                     self.hold_motors()  # nobody knows when the next part comes
         except (LinkError, LocalProtocolError):
             self._book.lost()
+            self.make_safe()
+            raise
+        except KeyboardInterrupt:  # not every caller has a `with` around it
             self.make_safe()
             raise
         finally:
@@ -304,9 +309,7 @@ class SerialPrinter(GuardedConversation):
             self._forget_z()
             raise NothingMetError(f"{error}") from error
         if not report.ok:
-            raise PrinterError(
-                "The touches were stopped; the nozzle was lifted and the heaters are off."
-            )
+            raise PrinterError(TOUCHES_STOPPED)
         if any(command in text for text in report.warnings):
             self.make_safe()
             how = (

@@ -18,9 +18,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Literal, Protocol, Self, TypeVar, runtime_checkable
 
-from gcode.errors import LinkError, LocalProtocolError
+from gcode.errors import LinkError, LocalProtocolError, PortBusyError
 from gcode.hosts.lock import PortLock
-from gcode.hosts.port import LinkLostError, PrintableProgram, Printer, PrintReport
+from gcode.hosts.port import (
+    LinkLostError,
+    PrintableProgram,
+    Printer,
+    PrintReport,
+    PrintsOnError,
+)
 from gcode.hosts.proof import require_arcs, require_checked
 from gcode.hosts.secret import ApiKey
 from gcode.hosts.unknown import UnknownCommands
@@ -325,8 +331,9 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         self._upload(job)
         self._delete(self._spent)
         self._spent = ""
-        self._start(job)
-        return self._watched(checked, job, start_s, progress, part=lines is not None)
+        return self._watched(
+            checked, job, start_s, progress, part=lines is not None, begin=self._start
+        )
 
     def _watched(
         self,
@@ -336,10 +343,14 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
         progress: Progress,
         *,
         part: bool,
+        begin: Callable[[JobFile], None] = lambda job: None,
     ) -> PrintReport:
-        """Follow a print to its end; a part of a job leaves its file to tell of it."""
+        """Begin a print, follow it to its end; a part of a job leaves its file to tell of it."""
         try:
+            begin(job)
             ok = self._follow(job, progress)
+        except PortBusyError:
+            raise  # somebody else was first: nothing of ours is under way
         except BaseException as error:  # an interrupt, too: the server would print on by itself
             self._make_safe(error)
             raise
@@ -455,11 +466,74 @@ class ServerPrinter(Printer, ABC, Generic[Session]):
 
     # ------------------------------------------------------------------ safety
 
+    def abort(self) -> None:
+        """Cancel our print, heaters off, nozzle lifted; harmless when not connected.
+
+        Raises
+        ------
+        PortBusyError
+            If another's print is under way, which is left alone.
+        PrintsOnError
+            If ours cannot be cancelled: its heaters are told to switch off all the same.
+        """
+        if self._open is None:
+            return
+        uncancelled = None
+        try:
+            if not self._cancel():
+                return
+        except PortBusyError:
+            raise
+        except LinkError as error:
+            uncancelled = error
+        self.heaters_off()
+        if uncancelled is not None:
+            raise PrintsOnError(
+                f"Heaters were told to switch off, BUT ITS PRINT GOES ON ({uncancelled}) and may "
+                "heat them again: stop it there, or switch the printer off."
+            ) from uncancelled
+        self._lift()
+
+    @abstractmethod
+    def _cancel(self) -> bool:
+        """Cancel our print and see it at rest; False where everything is off already.
+
+        Raises
+        ------
+        PortBusyError
+            If another's print is under way.
+        """
+
+    @abstractmethod
+    def _lift(self) -> None:
+        """Lift the nozzle, where that can be."""
+
+    @abstractmethod
+    def _refuse_anothers(self) -> None:
+        """Raise PortBusyError where another's print is under way."""
+
+    def _cools_ours(self) -> None:
+        """Refuse to cool another's print; where nobody tells whose it is, it passes for ours."""
+        try:
+            self._refuse_anothers()
+        except PortBusyError:
+            raise
+        except LinkError:
+            pass
+
+    def _anothers(self, file: str) -> PortBusyError:
+        return PortBusyError(
+            f"{self.address.name} is printing {file!r}, which is not ours: it was neither "
+            "cancelled nor cooled."
+        )
+
     def _make_safe(self, error: BaseException) -> None:
         """Make safe what can be reached, and add to the error how that went."""
         try:
             self.abort()
             word = heaters_word(self.temperatures)
+        except (PrintsOnError, PortBusyError) as second:
+            word = str(second)
         except (LinkError, LocalProtocolError) as second:
             word = f"HEATERS COULD NOT BE REACHED ({second}): switch the printer off."
         self._tried_safety = True

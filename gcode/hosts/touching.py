@@ -15,7 +15,7 @@ from gcode.check.touches import touch_lines
 from gcode.dialects import number
 from gcode.errors import PrinterError
 from gcode.hosts.port import NothingMetError, TellsTouches
-from gcode.hosts.serial import SerialPrinter
+from gcode.hosts.serial import TOUCHES_STOPPED, SerialPrinter
 from gcode.progress import Progress, silent
 from gcode.resumption.touch import Touching
 
@@ -136,7 +136,9 @@ def felt(
         at_contact()
         first = index + 1
     # not to its very end: that is for whoever sends the last of a job, and lets go of the motors
-    printer.print(checked, lines=range(first, len(lines) - 1), progress=progress)
+    report = printer.print(checked, lines=range(first, len(lines) - 1), progress=progress)
+    if not report.ok:
+        raise PrinterError(TOUCHES_STOPPED)
     printer.finish_moves()
     return felt_mm
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -335,6 +336,17 @@ def part_of(told: Mapping[str, Any], name: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def number_or_none(said: object) -> float | None:
+    """Return a finite number that a server told; None where it is none."""
+    if isinstance(said, bool) or not isinstance(said, int | float):
+        return None
+    try:
+        value = float(said)
+    except OverflowError:
+        return None
+    return value if math.isfinite(value) else None
+
+
 def sentence(answer: httpx.Response) -> str:
     """Return what a server says of an error, shortened."""
     error = (json_object(answer) or {}).get("error", "")
@@ -355,6 +367,6 @@ def heaters_word(read: Callable[[], Temperatures]) -> str:
         now = read()
     except LinkError:
         return "Heaters were told to switch off."
-    if now.hotend_target_c == 0.0 and not now.bed_target_c:
+    if not any((now.hotend_target_c, *now.hotend_targets_c, now.bed_target_c)):
         return "Heaters are off."
     return "Heaters were told to switch off."

@@ -1,13 +1,16 @@
 """The wire log: every byte either way with its time, in files that rotate.
 
 It is evidence, not logging: a file of its own, never filtered. It never sees a secret, because
-serial lines carry none.
+serial lines carry none. What cannot be written ends it, and nothing else.
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
 from pathlib import Path
 
+_log = logging.getLogger(__name__)
 FLUSH_ENTRIES = 2000
 FLUSH_S = 1.0
 """A killed sender's log ends no earlier than this before its death."""
@@ -36,9 +39,12 @@ class WireLog:
         self._file = path.open("ab")
         self._size = self._file.tell()
         self._entries: list[tuple[float, bytes, bytes]] = []
+        self._ended = False
 
     def add(self, now_s: float, direction: bytes, data: bytes) -> None:
         """Note bytes; they are written in batches."""
+        if self._ended:
+            return
         entries = self._entries
         if not entries:
             self._flush_s = now_s + FLUSH_S
@@ -57,11 +63,21 @@ class WireLog:
         ]
         self._entries.clear()
         blob = b"\n".join(rows) + b"\n"
-        if self._size and self._size + len(blob) > self._max_bytes:
-            self._rotate()
-        self._file.write(blob)
-        self._file.flush()
+        try:
+            if self._size and self._size + len(blob) > self._max_bytes:
+                self._rotate()
+            self._file.write(blob)
+            self._file.flush()
+        except OSError as error:
+            self._end(error)
         self._size += len(blob)
+
+    def _end(self, error: OSError) -> None:
+        """Log nothing more: a print, and above all its safe exit, does without."""
+        self._ended = True
+        _log.warning("the wire log %s ends here: %s", self.path, error.strerror or error)
+        with contextlib.suppress(OSError):  # it would write what was refused once more
+            self._file.close()
 
     def _rotate(self) -> None:
         self._file.close()
@@ -78,4 +94,5 @@ class WireLog:
     def close(self) -> None:
         """Write what is left and close."""
         self.flush()
-        self._file.close()
+        if not self._ended:
+            self._file.close()

@@ -18,14 +18,14 @@ _MADE_BY = re.compile(
     r"(?: on [^\n]*)?$|^;Generated with (Cura_SteamEngine[^\n]*)$",
     re.MULTILINE,
 )
-_LAYS = re.compile(r"^G[0-3] [^;\n]*[XYIJ][^;\n]*E[^\n]*$", re.MULTILINE)
+_LAYS = re.compile(r"^G[0-3] [^;\nEXYIJ]*[XYIJ][^;\nE]*E[^\n]*$", re.MULTILINE)
 _SETTINGS = re.compile(r"^; \w[\w \[\]]* = |^; EXECUTABLE_BLOCK_END", re.MULTILINE)
 _CURAS = re.compile(r"^;End of Gcode|^;SETTING_3 ", re.MULTILINE)
 # Motors or a heater off, a wait, the end, or a macro of Klipper's that is none of a print's middle;
 # the name of one that the file ends in may have been cut itself.
 _ENDS_A_PRINT = re.compile(
     r"^[ \t]*(?:M(?:0|1|2|18|30|84)(?!\d)|M(?:104|109|140) [^;\n]*S0*(?:\.0*)?(?![\d.])"
-    r"|(?!EXCLUDE_OBJECT|SET_|TIMELAPSE)[A-Z_]{3,}[^\n]*\n|\w*END\w*\Z)",
+    r"|(?!EXCLUDE_OBJECT|SET_|TIMELAPSE)[A-Z_]{3}[^\n]*\n|\w*END\w*\Z)",
     re.MULTILINE | re.IGNORECASE,
 )
 

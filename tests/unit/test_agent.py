@@ -27,6 +27,7 @@ from loop_bench import scan_of
 from small_klipper import CommandError, SmallKlipper
 
 from amrepair.agent import MACROS, shipped
+from amrepair.agent.shipped import UNIT
 from amrepair.loop.marked_stops import marked_stops
 from amrepair.loop.travel import park
 from amrepair.postprocess import LooksAsked, mark
@@ -34,7 +35,7 @@ from gcode.check import check
 from gcode.errors import PortBusyError, PrinterError
 from gcode.hosts import PrintReport
 from gcode.hosts.moonraker_job import KlipperJob
-from gcode.hosts.secret import ApiKey
+from gcode.hosts.secret import VARIABLES, ApiKey
 from gcode.hosts.web import Address
 from gcode.moves import Program
 from gcode.process import signals_end_it
@@ -202,9 +203,10 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
     (bench.folder / "gcodes" / "small_pla.gcode").write_text(twice.text)
     moved = bench.ready.whole.translate((6.0, 0.0, 0.0))
     bench.scans = [scan_of(moved), scan_of(moved)]
-    ended: list[str] = []
+    ended, said = list[str](), list[str]()
 
     def press(text: str) -> None:
+        said.append(text)
         if "footer_button Cancel the print" in text:
             heat = bench.klipper.modes
             ended.append(f"{heat.hotend_c:g} {heat.bed_c:g} {bench.klipper.print_state}")
@@ -215,6 +217,7 @@ def test_a_part_that_moved_ends_the_looks_and_the_heaters(bench: Bench) -> None:
     bench.answers = press
     assert bench.agent() == 4
     assert ended == ["0 0 paused"], "heaters are off and the print rests"
+    assert any("It rests. Heaters are off." in text for text in said)
     assert "no more looks at this print" in bench.told()
     assert bench.klipper.print_state == "complete", "somebody let it go on"
     back = bench.executed()[bench.executed().index("M140 S0") :]
@@ -440,3 +443,10 @@ def test_what_the_user_s_pause_pulls_back_is_not_lacking_in_the_repair(bench: Be
     assert back_mm[:-1][laid].max() < 1e-3  # every bead by a nozzle that is full
     still = later & ~goes & (pushed_mm > 0.0)
     assert (pushed_mm - back_mm[:-1])[still].max() < 1e-3  # and nothing in one place
+
+
+def test_the_unit_names_the_variable_that_is_read() -> None:
+    """Regression: it named one that nothing reads, and the key was missing."""
+    named = re.search(r"asks for one: (\w+)=", shipped(UNIT))
+    assert named is not None
+    assert named[1] == VARIABLES["moonraker"]

@@ -105,6 +105,18 @@ def test_a_question_waits_for_its_own_answer(tmp_path: Path) -> None:
     assert note["question"] is None
 
 
+def test_a_clock_that_is_set_back_silences_no_desk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: until the clock was where it had been, nobody heard how far the print was."""
+    desk = Desk(tmp_path)
+    desk.progress("print", 1.0, 10.0)
+    now_s = time.time() - 3600.0
+    monkeypatch.setattr("time.time", lambda: now_s)
+    desk.progress("print", 2.0, 10.0)
+    assert (read_note(tmp_path / STATUS) or {})["done"] == 2.0
+
+
 def test_nobody_answers_where_the_supervisor_has_gone(tmp_path: Path) -> None:
     parents = iter([10, 10, 1])
     desk = Desk(tmp_path, sleep=lambda _: None, parent=lambda: next(parents))
@@ -229,9 +241,30 @@ def test_a_question_is_answered_once_and_a_run_is_stopped(
     assert fleet.do("b", "stop")
     until(fleet, lambda: fleet.told()[1]["state"] == RunState.STOPPED)
     assert (tmp_path / "out" / "b" / "heaters").read_text() == "off"
+    told = fleet.told()[1]["sentence"]
+    assert told == "stopped; nothing was said of its heaters: see that they are off"
     fleet.end()
     assert states(fleet) == [RunState.STOPPED, RunState.STOPPED]
     assert (tmp_path / "out" / "a" / "heaters").read_text() == "off"
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_is_said_of_heaters_is_what_the_run_said_last(
+    tmp_path: Path, ended: list[Fleet]
+) -> None:
+    """Regression: a run that was stopped, or died, had its 'heaters off' whatever it had said."""
+    bodies = {
+        "off": "print('printer: heaters off (the printer reports targets of 0)', file=sys.stderr)",
+        "lost": "print('printer: HEATERS COULD NOT BE REACHED (x)', file=sys.stderr)",
+    }
+    fleet = fleet_of(
+        tmp_path, "off lost", fake(lambda spec: bodies[spec.name] + "; sys.exit(130)")
+    )  # fmt: skip
+    ended.append(fleet)
+    until(fleet, lambda: fleet.over)
+    rows = {row["name"]: row["sentence"] for row in fleet.told()}
+    assert rows["off"] == "stopped; heaters off (the printer reports targets of 0)"
+    assert rows["lost"] == "stopped; HEATERS COULD NOT BE REACHED (x)"
 
 
 def test_a_stuck_question_ends_its_run(tmp_path: Path, ended: list[Fleet]) -> None:

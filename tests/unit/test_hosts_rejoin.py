@@ -142,6 +142,10 @@ def test_a_moved_nozzle_a_cold_bed_free_motors_and_a_long_rest_are_refused(
     late = octo.prints[octo.file]["last"]["date"] + 500.0
     with pytest.raises(ResumeRefusedError, match="has rested for 5"):
         gone_on(printer_at(octo), wall_clock=lambda: late)
+    octo.file = left_there(octo)
+    octo.finish()
+    with pytest.raises(ResumeRefusedError, match="has rested for a time no clock tells"):
+        gone_on(printer_at(octo), wall_clock=lambda: late - 1000.0)  # regression: 0 s
     left_there(octo)
     octo.prints[octo.file] = {"success": 1, "last": {"success": True}}
     octo.files = {octo.file: octo.files.popitem()[1]}
@@ -162,3 +166,12 @@ def test_a_moved_nozzle_a_cold_bed_free_motors_and_a_long_rest_are_refused(
     moon.objects["heater_bed"]["target"] = 0.0
     gone_on(moon_printer(moon), pose_confirmed=True)
     assert "M190 S60" in moon.scripts  # somebody has looked: it is heated again
+
+
+@pytest.mark.parametrize(
+    "rows", [None, 3, "x", [None, 3], [{"path": None}], [{"path": "amrepair", "date": "now"}]]
+)
+def test_a_list_of_files_that_is_none_names_no_part(octo: FakeOctoPrint, rows: object) -> None:
+    octo.refuse["GET", "/api/files/local"] = (200, {"files": rows})
+    with printer_at(octo) as printer:
+        assert printer._left("gcode-") is None

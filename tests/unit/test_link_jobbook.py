@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import sqlite3
@@ -156,3 +157,15 @@ def test_a_file_is_the_program_and_nothing_more(
             reports = [printer.print(job, lines=part) for part in parts]
         assert (tmp_path / name).read_text() == job.program.text
         assert reports[-1].next_line == 4
+
+
+def test_a_clock_that_was_set_back_tells_no_silence(tmp_path: Path) -> None:
+    """Regression: one that began anew, as a Raspberry Pi's, had the printer left alone for 0 s."""
+    now_s = [10_000.0]
+    journal = Journal(tmp_path / "journal.sqlite", clock=lambda: now_s[0])
+    journal.open_session()
+    journal.begin("0" * 64, "/dev/ttyACM0", 0, 9)
+    journal.reserve(0, 1, 9, 0)
+    for later_s, silence_s in ((40.0, 40.0), (0.0, 0.0), (-1.0, 0.0), (-3600.0, math.inf)):
+        assert journal.longest_silence_s(now_s[0] + later_s) == silence_s
+    journal.close()

@@ -18,7 +18,7 @@ from link_helpers import moves, profile, program
 
 import gcode.hosts.serial as serial_host
 from gcode.cli.sending import send
-from gcode.errors import JournalError, JournalFileError, LinkError
+from gcode.errors import JournalError, JournalFileError, LinkError, PortBusyError
 from gcode.firmware import EmulatedPrinterProcess
 from gcode.hosts import supervisor
 from gcode.hosts.journal import Journal
@@ -289,3 +289,48 @@ def test_a_printer_that_refuses_us_is_not_ours_to_abort(
     with pytest.raises(LinkError, match="another job"):
         send(job, port="octoprint+http://nowhere", printer="generic_marlin")
     assert machine.aborted == 0
+
+
+def test_who_will_not_wait_for_the_safe_exit_leaves_it_to_the_supervisor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Regression: a third Ctrl+C sent the supervisor home with a farewell, and the heaters on."""
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port)
+        printer.connect()
+        printer.command("M104 S100")
+        monkeypatch.setattr(printer, "_comes_to_rest", interrupted)
+        monkeypatch.setattr(printer, "_go_past", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            printer.make_safe()
+        helper = printer._supervisor
+        assert helper is not None
+        printer.close()
+        with pytest.raises(PortBusyError):  # as long as the supervisor is at it
+            SerialPrinter(emulator.port).connect()
+        helper._process.wait(20)
+        assert emulator.state()["hotend_target_c"] == 0
+    assert "the supervisor goes on with it" in printer.notes[-1]
+
+
+def test_an_interrupted_print_is_safe_whoever_called_it() -> None:
+    """Regression: without a `with` around it, closing let go of a hot printer."""
+
+    def interrupted(stage: str, done: float, total: float) -> None:
+        if done > 0:
+            raise KeyboardInterrupt
+
+    with EmulatedPrinterProcess(printer=profile()) as emulator:
+        printer = SerialPrinter(emulator.port, supervise=False)
+        printer.connect()
+        printer.command("M104 S100")
+        with pytest.raises(KeyboardInterrupt):
+            printer.print(program(moves(2000)), progress=interrupted)
+        state = emulator.state()
+        printer.close()
+    assert state["hotend_target_c"] == 0
+    assert "heaters off" in printer.notes[-1]

@@ -116,3 +116,14 @@ def test_the_command_line_tells_counters_and_times(
     assert before_s <= float(rows[0].split()[0]) <= time.time()
     assert sum(b"Resend: " in row for row in rows) >= 7
     assert len(list((tmp_path / "gcode").iterdir())) >= 1  # the journal, where nobody named one
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk without room to write on")
+def test_a_full_disk_ends_the_log_and_not_the_print(caplog: pytest.LogCaptureFixture) -> None:
+    """Regression: a print, and then its safe exit, ended in the error of its log."""
+    log = WireLog(Path("/dev/full"))
+    for now_s in (0.0, 10.0, 20.0):
+        log.add(now_s, b">", b"M104 S0\n")
+        log.flush()
+    log.close()
+    assert caplog.text.count("the wire log /dev/full ends here: No space left on device") == 1

@@ -15,6 +15,7 @@ from amrepair.cli import running
 from amrepair.cli.app import app
 from amrepair.cli.live import NoView
 from amrepair.errors import AmrepairError, ScannerError
+from amrepair.loop import Tape
 from amrepair.repair import Stopwatch
 from gcode.cli import console
 
@@ -80,7 +81,7 @@ def test_a_run_that_a_scanner_ends_says_how_to_go_on(
         (folder / "run.jsonl").write_text('{"event": "send"}\n')
     monkeypatch.setattr(running, "_machine", lambda _: SimpleNamespace(close=lambda: None))
     monkeypatch.setattr(running, "print_run", silent)
-    begun: Any = SimpleNamespace(folder=SimpleNamespace(path=folder))
+    begun: Any = SimpleNamespace(folder=SimpleNamespace(path=folder), tape=Tape())
     how: dict[str, Any] = {"view": False, "going_on": False, "pose": False, "desk": None}
     with pytest.raises(ScannerError):
         running._printed(begun, NoView(), Stopwatch(), console.Bars(), **how)
@@ -102,7 +103,7 @@ def test_an_interrupt_in_compiled_code_says_how_to_go_on(
     machine = SimpleNamespace(close=lambda: closed.append(True))
     monkeypatch.setattr(running, "_machine", lambda _: machine)
     monkeypatch.setattr(running, "print_run", judging)
-    begun: Any = SimpleNamespace(folder=SimpleNamespace(path="out/loop"))
+    begun: Any = SimpleNamespace(folder=SimpleNamespace(path="out/loop"), tape=Tape())
     how: dict[str, Any] = {"view": False, "going_on": False, "pose": False, "desk": None}
     with pytest.raises(KeyboardInterrupt):
         running._printed(begun, NoView(), Stopwatch(), console.Bars(), **how)

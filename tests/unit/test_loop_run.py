@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import threading
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import loop_bench
 import numpy as np
 import pytest
 from loop_bench import LAYER, Small, Thermal, scan_of
 
-from amrepair.errors import ScannerError
+from amrepair.errors import LoopError, ScannerError
 from amrepair.frames import Transform
-from amrepair.loop import Action, Tape
+from amrepair.loop import Action, Stop, Tape
 from amrepair.loop.tape import read_events
 from amrepair.policy.limits import exceeded
+from amrepair.repair import Site
 from amrepair.scans import Scan
+from gcode.errors import LinkError
+from gcode.hosts.port import PrintReport
 from gcode.moves import Program
 from gcode.profiles import load_setup
 from gcode.reader import read_job
@@ -202,7 +209,69 @@ def test_a_run_that_is_interrupted_leaves_the_printer_safe_whatever_it_is_at(
         monkeypatch.setattr(Thermal, "make_safe", safe, raising=False)
     with pytest.raises(KeyboardInterrupt):
         small.run(tmp_path, silent)
-    assert told == ["safe" if on_a_cable else "heaters off"]
+    # on a cable before anybody waits, and at the end, where a link that is safe does nothing more
+    assert told == (["safe", "safe"] if on_a_cable else ["heaters off"])
+
+
+@pytest.mark.parametrize(("nth", "kind"), [(2, "park"), (3, "repair"), (4, "back")])
+def test_who_cancels_at_the_printer_ends_the_run_whatever_is_printed(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nth: int, kind: str
+) -> None:
+    """Regression: cancelled in a repair or on a way, the run looked again and printed on."""
+    prints, plain = list[PrintReport](), Thermal.print
+
+    def cancelled(printer: Thermal, *given: Any, **named: Any) -> PrintReport:
+        report = plain(printer, *given, **named)
+        prints.append(replace(report, ok=len(prints) + 1 != nth))
+        return prints[-1]
+
+    monkeypatch.setattr(Thermal, "print", cancelled)
+    pocket = small.block(-0.6, 0.5)
+    with pytest.raises(LoopError, match=f"^the {kind} was stopped at its line"):
+        small.run(
+            tmp_path,
+            lambda n: scan_of(small.standing - pocket if n == 1 else small.standing),
+            limits=small.setup.process,
+        )
+    assert len(prints) == nth
+
+
+def test_an_interrupt_waits_for_nothing_that_is_made_beside_the_print(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: the nozzle stayed in the part, hot, until what the next look needs was made."""
+    safe, made_safe_first = threading.Event(), list[bool]()
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    def slow(stop: Stop) -> Site:
+        made_safe_first.append(safe.wait(5.0))
+        raise LoopError("nobody needs it any more")
+
+    monkeypatch.setattr(Thermal, "print", interrupted)
+    monkeypatch.setattr(Thermal, "make_safe", lambda _: safe.set(), raising=False)
+    monkeypatch.setattr(loop_bench, "sites", lambda *_, **__: slow)
+    with pytest.raises(KeyboardInterrupt):
+        small.run(tmp_path, silent)
+    assert made_safe_first == [True]
+
+
+def test_heaters_that_cannot_be_reached_at_the_end_are_told(
+    small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Regression: a run that a decision ended said 'heaters off', and nobody had heard of it."""
+
+    def unreachable(_: Thermal) -> None:
+        raise LinkError("the port failed")
+
+    monkeypatch.setattr(Thermal, "heaters_off", unreachable)
+    away = Transform.from_rotation_translation(
+        "scanner", "scanner", rotation=np.eye(3), translation_mm=np.array([40.0, 0.0, 0.0])
+    )
+    report, _ = small.run(tmp_path, lambda n: scan_of(small.standing).moved(away))
+    assert report.stopped
+    assert "HEATERS COULD NOT BE REACHED (the port failed): switch the printer off" in caplog.text
 
 
 def test_a_scan_that_does_not_fit_is_taken_again_before_the_run_ends(

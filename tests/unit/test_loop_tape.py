@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -65,6 +67,7 @@ def test_a_run_that_a_question_ended_looks_anew(tmp_path: Path) -> None:
     for event in ("send", "sent", "look"):
         tape.write(event, look=1)
     tape.write("end", stopped="pause and ask: warp")
+    tape.close()
     again = Tape(tmp_path)
     again.reopen()
     assert [again.next(event) is not None for event in ("send", "sent", "look")] == [
@@ -79,8 +82,10 @@ def test_a_run_that_is_over_is_over(tmp_path: Path) -> None:
         Tape(tmp_path).reopen()
     tape = Tape(tmp_path)
     tape.write("end", stopped="")
-    with pytest.raises(InputError, match="printed to its end"):
-        Tape(tmp_path).reopen()
+    tape.close()
+    for _ in range(2):  # nobody keeps it
+        with pytest.raises(InputError, match="printed to its end"):
+            Tape(tmp_path).reopen()
 
 
 def test_a_file_of_somebody_elses_is_refused(tmp_path: Path) -> None:
@@ -126,3 +131,46 @@ def test_a_resumed_run_tells_of_the_part_that_is_under_way(
         release_c=40.0, pose_confirmed=False,
     )  # fmt: skip
     assert heard == told
+
+
+def test_two_commands_are_never_at_one_run(tmp_path: Path) -> None:
+    """Regression: both wrote into one record, and the later took the earlier one's job away."""
+    first = Tape(tmp_path)
+    first.hold(anew=True)
+    first.write("send", kind="job")
+    for other in (lambda: Tape(tmp_path).hold(anew=True), lambda: Tape(tmp_path).reopen()):
+        with pytest.raises(InputError, match="another command is at the run in"):
+            other()
+    assert [e["event"] for e in read_events(tmp_path)] == ["send"]
+    first.close()
+    again = Tape(tmp_path)
+    again.reopen()
+    assert again.next("send") is not None
+    again.close()
+    anew = Tape(tmp_path)
+    anew.hold(anew=True)
+    assert anew.live
+    assert read_events(tmp_path) == []
+    anew.close()
+
+
+def test_a_disk_that_takes_half_a_line_has_not_taken_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: a nearly full disk took a part without a word, and what came after was lost."""
+    tape, room, write = Tape(tmp_path), [10], os.write
+    tape.write("send", kind="job")
+
+    def nearly_full(fd: int, data: bytes) -> int:
+        if not room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(fd, data[: room.pop()])
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.write", nearly_full)
+        with pytest.raises(LoopError, match=r"run\.jsonl cannot be written \(No space left"):
+            tape.write("sent")
+    assert [e["event"] for e in read_events(tmp_path)] == ["send"]
+    tape.write("sent")
+    assert [e["event"] for e in read_events(tmp_path)] == ["send", "sent"]
+    tape.close()

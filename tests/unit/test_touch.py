@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +15,10 @@ from touch_job import HEIGHT_MM, SPARSE_LAYER, X_MM, Y_MM, touch_job
 
 from gcode.check import Touch, find_refusals
 from gcode.check.checker import judge
-from gcode.errors import InputError, ProfileError
+from gcode.errors import InputError, PrinterError, ProfileError
 from gcode.firmware import FirmwareCore
 from gcode.firmware.contact import ProbeContact
+from gcode.hosts.touching import felt
 from gcode.moves import Program
 from gcode.profiles import PrintSetup, load_setup
 from gcode.resumption.touch import TouchOptions, plan_touch
@@ -198,3 +201,13 @@ def test_prusas_firmware_and_klipper_know_no_such_touch(setup: PrintSetup) -> No
         core.feed(b"G38.2 Z1 F120\n")
         core.run()
         assert b"nknown command" in core.take_output()
+
+
+def test_touches_that_somebody_cancels_after_the_last_are_not_taken_for_made() -> None:
+    """Regression: stopped on its way back from the last touch, it passed for done."""
+    printer: Any = SimpleNamespace(
+        touch=lambda *_, **__: 2.9, print=lambda *_, **__: SimpleNamespace(ok=False)
+    )
+    checked: Any = SimpleNamespace(program=touching("G38.2 Z2.7 F120"))
+    with pytest.raises(PrinterError, match="The touches were stopped"):
+        felt(printer, checked)
