@@ -25,6 +25,7 @@ GRADUATION = 1.4  # the loss is narrowed by this factor a step (Yang et al. 2020
 STEPS_PER_WIDTH = 3
 FINAL_STEPS = 60
 SCALE_STEPS = 30
+LEAST_SOUND = 0.25  # of what was observed
 FINALISTS = 3  # descents that are followed to their end
 NARROW = 4.0  # data without any noise are judged by a quarter of what a part is allowed
 CONVERGED_RATIO = 1e-6  # of a prior's standard deviation
@@ -56,14 +57,19 @@ class Problem:
         return self.observed_mm - self.design @ unknown
 
     def noise_mm(self, unknown: Values) -> float:
-        """Standard deviation of one observation, by those that the loss would count."""
+        """Standard deviation of one observation, by those that the loss would count.
+
+        Counted are the nearest `LEAST_SOUND` of them, and what their noise reaches: of a flat part
+        that stopped early most lies too low, and would be taken for noise from above.
+        """
         off = np.abs(self.residual_mm(unknown))
         order = np.argsort(off, kind="stable")
         off, reached = off[order], np.cumsum(self.share[order])
-        noise_mm = np.inf
+        least = int(np.searchsorted(reached, LEAST_SOUND * reached[-1]))
+        noise_mm = 0.0
         for _ in range(SCALE_STEPS):
-            last = np.searchsorted(off, self.width_mm(noise_mm), side="right") - 1
-            middle = off[np.searchsorted(reached, reached[max(int(last), 0)] / 2)]
+            last = int(np.searchsorted(off, self.width_mm(noise_mm), side="right")) - 1
+            middle = off[np.searchsorted(reached, reached[max(last, least)] / 2)]
             before_mm, noise_mm = noise_mm, MAD_TO_SIGMA * float(middle)
             if noise_mm == before_mm:
                 break

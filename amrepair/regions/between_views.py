@@ -122,27 +122,37 @@ class ViewErrors:
         cell_by = 1.0 / scales_kernels.window_means(scale.table, scale.count, alone)
         judged = scale.is_surface & ~scale.apart
         one_mm = _one_mm(points[judged], total_mm[judged])
-        return cls(one_mm, cell_by, _worth(own), _here_mm(points, total_mm, scale.median_mm))
+        here_mm = _here_mm(points, total_mm, scale.median_mm, one_mm)
+        return cls(one_mm, cell_by, _worth(own), here_mm)
 
 
 def _here_mm(
-    points: Float[np.ndarray, "s v"], total_mm: Float[np.ndarray, "s v"], told_mm: Values
+    points: Float[np.ndarray, "s v"],
+    total_mm: Float[np.ndarray, "s v"],
+    told_mm: Values,
+    one_mm: float,
 ) -> Values:
     """(s,) standard error of what each window tells, by what its own views say; 0 of one view.
 
-    Each view speaks by its points, up to those that make a surface: more of them err together.
+    Each view speaks by its points, up to those that make a surface: more of them err together. The
+    share of their spread that views usually have, one standard deviation each, is left out: few
+    views often lie farther apart by chance.
 
     References
     ----------
     Liang & Zeger, "Longitudinal data analysis using generalized linear models", 1986: the variance
-    by clusters, here views.
+    by clusters, here views. DerSimonian & Laird, "Meta-analysis in clinical trials", 1986: what is
+    left of a spread beyond the usual, Q - (k - 1).
     """
     views = (points > 0.0).sum(axis=1)
-    mean_mm = total_mm / np.maximum(points, 1.0)
+    off_mm = total_mm / np.maximum(points, 1.0) - told_mm[:, None]
     says = np.minimum(points, RANK * CELL_POINTS)
-    off = np.square(says * (mean_mm - told_mm[:, None])).sum(axis=1)
-    off *= views / np.maximum(views - 1, 1)
-    return np.where(views > 1, np.sqrt(off) / np.maximum(says.sum(axis=1), 1.0), 0.0)
+    every = np.maximum(says.sum(axis=1), 1.0)
+    several = views / np.maximum(views - 1, 1)
+    spread = several * (says * np.square(off_mm)).sum(axis=1) / every
+    beyond = np.maximum(1.0 - one_mm**2 / np.maximum(spread, np.finfo(float).tiny), 0.0)
+    variance = several * np.square(says * off_mm).sum(axis=1) / every**2
+    return np.where(views > 1, np.sqrt(beyond * variance), 0.0)
 
 
 def _worth(points: Float[np.ndarray, "s v"]) -> Values:
