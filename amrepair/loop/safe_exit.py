@@ -39,10 +39,8 @@ def _tell_heaters(printer: Printer) -> None:
     """What the printer says of heaters that were told to switch off; some are meant to stay on."""
     if isinstance(printer, FilePrinter):
         return
-    now = printer.temperatures()
-    targets_c = [c for c in (*now.hotend_targets_c, now.bed_target_c) if c]
-    if targets_c:
-        on = " and ".join(f"{c:g} °C" for c in targets_c)
+    if set_c := printer.temperatures().set_c:
+        on = " and ".join(f"{c:g} °C" for c in set_c)
         _log.warning("printer: heaters are NOT off: the printer says that they are set to %s", on)
     else:
         _log.warning("printer: heaters off (the printer reports targets of 0)")

@@ -53,9 +53,10 @@ def without_systematic_errors(
     out: tuple[Contradiction, ...] = ()
     while True:
         seen, inspected = observe(tuple(one.view for one in out))
-        nuisance, shares = None, seen.shares
+        nuisance = None
         if pose != "told":
-            nuisance, inspected, shares = _without_nuisance(seen, inspected, pose, options)
+            nuisance, inspected = _without_nuisance(seen, inspected, pose, options)
+        shares = inspected.shares
         if out or shares is None:
             return _as_made(seen, nuisance), inspected, nuisance, out
         feet_mm = inspected.place_mm[: inspected.cells]
@@ -92,7 +93,7 @@ def _as_made(seen: Observed, nuisance: Nuisance | None) -> Observed:
 
 def _without_nuisance(
     seen: Observed, inspected: Inspected, pose: PoseKnown, options: RegionOptions
-) -> tuple[Nuisance, Inspected, Shares | None]:
+) -> tuple[Nuisance, Inspected]:
     """Estimate pose, scale, bow and view offsets, and subtract them from all deviations."""
     n, views_known = inspected.cells, seen.shares is not None
     every = np.arange(n)
@@ -119,8 +120,7 @@ def _without_nuisance(
     if views_known:
         pose_mm = np.hypot(pose_mm, _between_views_mm(left, len(pose_mm), seen.surfels.spread_mm))
     shares = left if views_known else None
-    inspected = replace(inspected, value_mm=whole_mm, pose_mm=pose_mm, shares=shares)
-    return found, inspected, shares
+    return found, replace(inspected, value_mm=whole_mm, pose_mm=pose_mm, shares=shares)
 
 
 def _halves_joined(inspected: Inspected, told: Shares) -> tuple[Points, Points, Shares]:

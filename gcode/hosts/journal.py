@@ -38,6 +38,12 @@ CLOCK_SLEW_S = 5.0
 FOREIGN_LINES = 50_000
 """Most commands of the host's own after a step: a question a second for half a day of pause."""
 
+
+def passed_s(then_s: float, now_s: float) -> float:
+    """How long it is from then until now, s; infinite where a clock was set back since."""
+    return math.inf if now_s < then_s - CLOCK_SLEW_S else max(now_s - then_s, 0.0)
+
+
 _JOURNAL_SCHEMA = """
 CREATE TABLE IF NOT EXISTS session (
     id INTEGER PRIMARY KEY,
@@ -379,9 +385,7 @@ class Journal:
             " AND time_s > (SELECT time_s FROM stepped) ORDER BY 1"
         )
         times_s = [row[0] for row in rows if row[0] is not None] or [now_s]
-        if now_s < times_s[-1] - CLOCK_SLEW_S:
-            return math.inf
-        return max(b - a for a, b in pairwise([*times_s, max(now_s, times_s[-1])]))
+        return max([passed_s(times_s[-1], now_s), *(b - a for a, b in pairwise(times_s))])
 
     def notes(self) -> tuple[str, ...]:
         """Return the remarks, oldest first."""

@@ -17,7 +17,7 @@ import httpx
 from gcode.errors import LinkError
 from gcode.hosts.octoprint_state import ServerState
 from gcode.hosts.server import ServerReach, ServerSession
-from gcode.hosts.web import json_object, part_of, sentence
+from gcode.hosts.web import json_object, number_or_none, part_of, sentence
 from gcode.protocol import events as ev
 from gcode.protocol.replies import parse_reply
 
@@ -102,7 +102,7 @@ class OctoPrintSession(ServerSession[ServerState]):
         report = self.web.get("/api/job")
         done = part_of(report, "progress").get("completion")
         name = part_of(part_of(report, "job"), "file").get("name")
-        return str(name), float(done) if isinstance(done, int | float) else 0.0
+        return str(name), number_or_none(done) or 0.0
 
     def look(self) -> bool:
         """Ask for the state, listening anew where the socket has ended.

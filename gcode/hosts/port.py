@@ -55,6 +55,11 @@ class Temperatures:
         """The target of each head."""
         return self.targets_c or (self.hotend_target_c,)
 
+    @property
+    def set_c(self) -> tuple[float, ...]:
+        """The targets of the heaters that are not off."""
+        return tuple(c for c in (*self.hotend_targets_c, self.bed_target_c) if c)
+
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:

@@ -7,15 +7,14 @@ followed to its end), done, failed. Nothing is sent twice; what does not add up 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gcode.hosts.journal import CLOCK_SLEW_S
+from gcode.hosts.journal import passed_s
 from gcode.hosts.modes import Modes, modes_after
 from gcode.hosts.port import PrintableProgram, PrintReport, ResumeRefusedError
-from gcode.hosts.resume import MOTORS_HELD_S, SAME_PLACE_MM
+from gcode.hosts.resume import MOTORS_HELD_S, SAME_PLACE_MM, for_how_long
 from gcode.hosts.server import ServerPrinter
 from gcode.progress import Progress, silent
 
@@ -78,9 +77,7 @@ def rejoin(
     for program, first, end in (*before, *over):
         dialect = program.program.dialect
         modes = modes_after(program, end, dialect, first=first, modes=modes)
-    idle_s = 0.0 if ended_s is None else wall_clock() - ended_s
-    if idle_s < -CLOCK_SLEW_S:
-        idle_s = math.inf  # one of the two clocks was set since
+    idle_s = 0.0 if ended_s is None else passed_s(ended_s, wall_clock())
     require_as_left(
         printer, modes, refused, dialect=checked.program.dialect, release_c=release_c,
         pose_confirmed=pose_confirmed, idle_s=idle_s,
@@ -121,8 +118,9 @@ def require_as_left(
     if not pose_confirmed:
         hint = "confirm by a rescan where the part stands, and say --pose-confirmed"
         if idle_s > MOTORS_HELD_S:
-            long = f"for {idle_s:.0f} s" if math.isfinite(idle_s) else "for a time no clock tells"
-            raise refused(f"it has rested {long} and may have let go of its motors; {hint}")
+            raise refused(
+                f"it has rested {for_how_long(idle_s)} and may have let go of its motors; {hint}"
+            )
         bed_c = printer.temperatures().bed_c
         if modes.bed_c > release_c and bed_c is not None and bed_c < release_c:
             raise refused(

@@ -35,6 +35,11 @@ MOST_IN_DOUBT = 64
 """Lines whose places are compared where there are no line numbers."""
 
 
+def for_how_long(passed_s: float) -> str:
+    """Say how long a printer was at rest; infinite where a clock was set since."""
+    return f"for {passed_s:.0f} s" if math.isfinite(passed_s) else "for a time no clock tells"
+
+
 def resume(
     printer: SerialPrinter,
     checked: PrintableProgram,
@@ -286,12 +291,10 @@ class _Resumption:
 
     def _require_motors(self) -> None:
         if self._silence_s > MOTORS_HELD_S:
-            known = math.isfinite(self._silence_s)  # else the clock was set back since
-            long = f"for {self._silence_s:.0f} s" if known else "for a time that no clock tells"
             self._refuse(
-                f"the printer was left alone {long} and lets go of its motors after "
-                f"{MOTORS_HELD_S:g} s; confirm by a rescan where the part stands, and say "
-                f"--pose-confirmed"
+                f"the printer was left alone {for_how_long(self._silence_s)} and lets go of its "
+                f"motors after {MOTORS_HELD_S:g} s; confirm by a rescan where the part stands, and "
+                f"say --pose-confirmed"
             )
 
     def _require_warm(self, modes: Modes) -> None:

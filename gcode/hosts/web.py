@@ -367,6 +367,6 @@ def heaters_word(read: Callable[[], Temperatures]) -> str:
         now = read()
     except LinkError:
         return "Heaters were told to switch off."
-    if not any((now.hotend_target_c, *now.hotend_targets_c, now.bed_target_c)):
+    if not now.set_c:
         return "Heaters are off."
     return "Heaters were told to switch off."
