@@ -5,8 +5,8 @@ from which layer on all beads lie aside, by how much in X and Y; and which share
 those layers should have is there, in any mix of shares over the layer. Unmoved, it explains layers
 that are as planned, thin, or gone; moved, it explains layers that the motors have put elsewhere. Of
 one look both are fitted, and the evidence of the moved one over the best unmoved one is told patch
-by patch. Errors hang together within a patch and not beyond it, so that a patch is one observation,
-whose log density is the mean of its points'. Two things are asked of the evidence:
+by patch. Errors hang together within a patch and not beyond it: how much they do so the look tells
+itself, and so of how many observations a patch is worth. Two things are asked of the evidence:
 
 - There is enough of it for all the moves that were tried. Were the unmoved model true, a likelihood
   ratio of e^x would be as rare as e^-x (Markov's inequality; Vovk and Wang, "E-values", Annals of
@@ -21,10 +21,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.special import ndtri, stdtr
 
-from amrepair.arrays import Points, Values
+from amrepair.arrays import Numbers, Points, Values
 from amrepair.loop import layer_shift_kernels as kernels
 from gcode.reader import Job
 from gcode.surfaces.lines import heights_by_lines
@@ -110,7 +110,7 @@ class ShiftOptions:
     cell_mm: float = 0.1
     most_cells: int = 1_500_000
     layers_back: int = 8
-    growth: float = 1.3
+    growth: float = 1.15
 
 
 DEFAULT_SHIFT = ShiftOptions()
@@ -327,13 +327,16 @@ def layer_shift(
     patch = _patches(seen, options.patch_mm)
     if patch.max() + 1 < options.least_patches:
         return None
-    if not regions and _by_walls(seen)[0] < np.log(_moves_as_far(seen, options.step_mm)):
+    by_walls = _by_walls(seen)
+    if not regions and by_walls[0] < np.log(_moves_as_far(seen, options.step_mm)):
         return None
-    fits = _fits(seen)
+    fits = _fits(seen, *by_walls[1:])
     if fits is None or fits[0].size_mm <= options.tolerance_mm:
         return None
     moved, rival = fits
-    gain = np.bincount(patch, moved.log_density - rival.log_density) / np.bincount(patch)
+    kinds = (slice(0, len(seen.place_mm)), slice(len(seen.place_mm), None))
+    worth = np.concatenate([_worth(moved.log_density[one], patch[one]) for one in kinds])
+    gain = np.bincount(patch, worth * (moved.log_density - rival.log_density))
     spread = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
     if float(stdtr(len(gain) - 1, -gain.mean() / spread)) > options.spread_level:
         return None
@@ -345,14 +348,16 @@ def layer_shift(
     return LayerShift(moved.layer, (x_mm, y_mm), p_value, sure)
 
 
-def _fits(seen: _Seen) -> tuple[_Fit, _Fit] | None:
-    """The best explanations with and without a move.
+def _fits(
+    seen: _Seen, by_walls: int, walls_move: Float[np.ndarray, " 4"]
+) -> tuple[_Fit, _Fit] | None:
+    """The best explanations with and without a move; walls alone tell one, from some layer on.
 
     None where a part of the points tells that the move explains no more than as many moves do by
     chance.
     """
     some = seen.some(seen.options.second_points)
-    first = _moved(some)
+    first = _moved(some, by_walls, walls_move)
     if first.total - _unmoved(some).total < np.log(_moves_as_far(seen, first.size_mm)):
         return None
     moved = _best_layer(seen, _climbed(seen, first.layer, first.move, _MOVES_AROUND))
@@ -426,7 +431,7 @@ def _layers(first: int, last: int, options: ShiftOptions) -> list[int]:
     return found[::-1]
 
 
-def _patches(seen: _Seen, patch_mm: float) -> Int[np.ndarray, " n"]:
+def _patches(seen: _Seen, patch_mm: float) -> Numbers:
     """Of each point, walls after tops, the number of its patch."""
     place_mm = np.concatenate([seen.place_mm, seen.walls.place_mm])
     cell = np.floor(place_mm / patch_mm).astype(np.int64)
@@ -434,27 +439,52 @@ def _patches(seen: _Seen, patch_mm: float) -> Int[np.ndarray, " n"]:
     return np.asarray(number.reshape(-1))
 
 
-def _by_walls(seen: _Seen) -> tuple[float, int, Float[np.ndarray, " 4"]]:
-    """How much more the best of some small moves explains of the walls alone than none; that one.
+def _worth(log_density: Values, patch: Numbers) -> Values:
+    """Of each point, what part of an independent observation it is, of one kind of surface.
 
-    Far moves tell nothing here: walls are held against the nearest surface.
+    Errors that correlate by ρ leave n / (1 + (n - 1) ρ) of a patch's n points (Kish, "Survey
+    Sampling", 1965: the design effect). A log density is the square of an error, and squares of
+    normal errors correlate by ρ²: the share of their variance that lies between patches, as the
+    analysis of variance tells it.
+    """
+    _, patch = np.unique(patch, return_inverse=True)
+    count = np.bincount(patch).astype(np.float64)
+    points, patches = len(patch), len(count)
+    if not 1 < patches < points:
+        return np.asarray(1.0 / count[patch])
+    mean = np.bincount(patch, log_density) / count
+    within = float(((log_density - mean[patch]) ** 2).sum()) / (points - patches)
+    between = float((count * (mean - log_density.mean()) ** 2).sum()) / (patches - 1)
+    usual = (points - float((count**2).sum()) / points) / (patches - 1)
+    share = (between - within) / max(between + (usual - 1.0) * within, 1e-12)
+    together = float(np.sqrt(np.clip(share, 0.0, 1.0)))
+    return np.asarray(1.0 / (1.0 + (count[patch] - 1.0) * together))
+
+
+def _by_walls(seen: _Seen) -> tuple[float, int, Float[np.ndarray, " 4"]]:
+    """How much more of the walls alone small moves of upper and lower ones explain than one of all.
+
+    From which layer on, and the moves. Far moves tell nothing here: walls are held against the nearest surface.
     """
     o = seen.options
     far = 0.5 * o.step_mm * np.arange(-4.0, 5.0)
     by = np.array([(x, y) for x in far for y in far])
-    moves = np.vstack([np.zeros(4), np.hstack([by, 0.0 * by]), np.hstack([0.0 * by, -by])])
-    layers = [*seen.before_mm]
-    told = np.array([
-        seen.walls.log_density(seen.cut_mm(layer), moves, o).sum(axis=0) for layer in layers
-    ])  # fmt: skip
-    layer, best = np.unravel_index(told.argmax(), told.shape)
-    return float(told.max() - told[0, 0]), layers[int(layer)], moves[int(best)]
+    told = seen.walls.log_density(0.0, np.hstack([by, by]), o)
+    fits: list[tuple[float, int, Float[np.ndarray, " 4"]]] = []
+    for layer in seen.before_mm:
+        above = seen.walls.place_mm[:, 2] > seen.cut_mm(layer)
+        upper, lower = told[above].sum(axis=0), told[~above].sum(axis=0)
+        one, other = int(upper.argmax()), int(lower.argmax())
+        gain = float(upper[one] + lower[other] - (upper + lower).max())
+        fits.append((gain, layer, np.concatenate([by[one], by[other]])))
+    return max(fits, key=lambda fit: fit[0])
 
 
-def _moved(seen: _Seen) -> _Fit:
+def _moved(seen: _Seen, by_walls: int, walls_move: Float[np.ndarray, " 4"]) -> _Fit:
     """The best explanation by layers that lie aside of those below.
 
-    The scan was registered to both of them: it may lie as either does, or between.
+    The scan was registered to both of them: it may lie as either does, or between. What all walls
+    tell is one of the moves to begin with.
     """
     o = seen.options
     far = np.arange(-o.reach_mm, o.reach_mm + 0.5 * o.step_mm, o.step_mm)
@@ -466,7 +496,6 @@ def _moved(seen: _Seen) -> _Fit:
         told = few.evidence(layer, grid, mix)
         best_of = [int(part.argmax()) for part in told.reshape(2, -1)]
         first += [(float(told[k]), grid[k]) for k in (best_of[0], len(by) + best_of[1])]
-    _, by_walls, walls_move = _by_walls(seen)
     fits = [_climbed(seen, by_walls, walls_move, _MOVES_AROUND)]
     for _, move in sorted(first, key=lambda one: -one[0])[: o.refined]:
         told_by = [few.evidence(layer, move[None], mix)[0] for layer in layers]

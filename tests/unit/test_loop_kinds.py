@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from manifold3d import Manifold
 
+from amrepair.errors import PartMovedError
 from amrepair.frames import Transform
 from amrepair.loop import kinds
 from amrepair.loop.kind_options import DEFAULT_KINDS
@@ -99,9 +100,21 @@ def test_what_a_patch_left_is_no_clog(bench: ModuleType, scene) -> None:  # type
 def test_nine_of_ten_are_told(bench: ModuleType, scene, seed: int) -> None:  # type: ignore[no-untyped-def]
     right = 0
     for kind in bench.KINDS:
-        found = types_in(planned(bench, scene, kind, 100 + seed), scene)
+        try:
+            found = types_in(planned(bench, scene, kind, 100 + seed), scene)
+        except PartMovedError:  # farther than a look's alignment goes, and said so
+            found = {"detached": 1.0}
         right += bool(found) and max(found, key=found.__getitem__) == kind
     assert right >= 0.9 * len(bench.KINDS)
+
+
+@pytest.mark.parametrize("draw", [16, 102])
+def test_a_shift_of_two_standard_deviations_is_told(bench: ModuleType, scene, draw: int) -> None:  # type: ignore[no-untyped-def]
+    # regression: 17 in 40 of them were not: a patch was one observation, though its points erred
+    # each for itself (102), and a part of the walls, of which upper and lower ones had moved in
+    # opposite ways, told another layer to begin with (16)
+    found = types_in(planned(bench, scene, "layer_shift", draw), scene)
+    assert set(found) == {"layer_shift"}
 
 
 def test_a_clean_surface_has_no_type(bench: ModuleType, scene) -> None:  # type: ignore[no-untyped-def]

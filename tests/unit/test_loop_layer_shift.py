@@ -180,6 +180,22 @@ def test_walls_tell_where_tops_are_as_they_should_be(box: tuple[Job, int], sides
     assert abs(found.layer - 8) <= 1
 
 
+def alike_in_patches(place: np.ndarray, seed: int) -> np.ndarray:
+    """Errors of 0.3 mm that are the same all over a patch of 2 mm."""
+    cell = np.floor((place - np.append(CORNER, 0.0)) / 2.0 + 1e-9)  # a face lies on its border
+    _, number = np.unique(cell, axis=0, return_inverse=True)
+    of_cell = np.random.default_rng(seed).normal(0.0, 0.3, number.max() + 1)
+    return np.asarray(of_cell[number.reshape(-1)])
+
+
+@pytest.mark.parametrize("draw", draws(range(14, 18), 17))
+def test_points_that_err_alike_are_one_observation(box: tuple[Job, int], draw: int) -> None:
+    # of as many observations as there are points, the last one's p-value is 1e-130
+    job, line = box
+    walls = walls_of(lambda place, out: alike_in_patches(place, draw))
+    assert layer_shift(seen_from_above(job, whole), walls, NOISE_MM, job, line) is None
+
+
 def test_a_few_points_of_one_place_tell_no_shift(box: tuple[Job, int]) -> None:
     # regression: of a belt idler's top two walls were seen, and five points of a chip in a third
     job, line = box
