@@ -464,7 +464,8 @@ def _worth(log_density: Values, patch: Numbers) -> Values:
 def _by_walls(seen: _Seen) -> tuple[float, int, Float[np.ndarray, " 4"]]:
     """How much more of the walls alone small moves of upper and lower ones explain than one of all.
 
-    From which layer on, and the moves. Far moves tell nothing here: walls are held against the nearest surface.
+    From which layer on, and the moves. Far moves tell nothing here: walls are held against the
+    nearest surface.
     """
     o = seen.options
     far = 0.5 * o.step_mm * np.arange(-4.0, 5.0)
