@@ -201,6 +201,11 @@ class Program:
     def __post_init__(self) -> None:
         object.__setattr__(self, "sha256", hashlib.sha256(self.text.encode()).hexdigest())
 
+    @property
+    def line_count(self) -> int:
+        """How many lines it has."""
+        return self.text.count("\n")
+
     def lines(self) -> Iterator[str]:
         """Lines without their newline."""
         return iter(self.text.splitlines())

@@ -235,7 +235,7 @@ def _result(
         ),
         "job": {
             "gcode": str(folder.file("job.gcode")),
-            "lines": run.prepared.checked.program.text.count("\n"),
+            "lines": run.prepared.checked.program.line_count,
             "layers": len(run.prepared.job.layers),
             "printer_clock_s": round(run.printer_clock_s, 1),
             "unprintable_mm3": rounded(sum(u.volume_mm3 for u in run.prepared.plan.unprintable)),

@@ -106,7 +106,7 @@ class Run:
 
         What is to be expected at the `coming` stop is made meanwhile.
         """
-        first, lines = self._next_line, self._base + _lines(self._checked)
+        first, lines = self._next_line, self._base + self._checked.program.line_count
         end = self._course.line(end)
         if first >= end:
             return
@@ -175,7 +175,7 @@ class Run:
             action = look.decision.action
             if look.printed and look.plan.checked is not None:
                 with self._watch("repair"):
-                    lines = _lines(look.plan.checked)
+                    lines = look.plan.checked.program.line_count
                     told = self._telling("repair", 0, lines, lines)
                     report = self._wire.send("repair", look.plan.checked, progress=told)
                     if report is not None:
@@ -464,10 +464,6 @@ class Run:
             if fills and not (barred or situation.last_pass or situation.stuck):
                 return replace(look, printed=self._approval.approve(look.plan))
         return look
-
-
-def _lines(checked: CheckedProgram) -> int:
-    return checked.program.text.count("\n")
 
 
 def _why(decision: Decision) -> str:

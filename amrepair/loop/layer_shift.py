@@ -37,10 +37,9 @@ class ShiftOptions:
     Attributes
     ----------
     false_alarm
-        Probability that a look at layers which lie where they should tells a shift.
-    spread_level
-        Probability that patches which speak for neither explanation differ so much to one side:
-        what passes only the other test is told by a few patches, as damage is.
+        Probability that a look at layers which lie where they should tells a shift; and that
+        patches which speak for neither explanation differ so much to one side: what passes only
+        the first test is told by a few patches, as damage is.
     prior
         Of looks, the share at which layers have shifted: what evidence is held against, for how
         sure a shift is. What is no surer than as sure as not is looked at again.
@@ -85,7 +84,6 @@ class ShiftOptions:
     """
 
     false_alarm: float = 1e-3
-    spread_level: float = 1e-2
     prior: float = 1e-2
     tolerance_mm: float = 0.2
     reach_mm: float = 5.0
@@ -333,12 +331,13 @@ def layer_shift(
     fits = _fits(seen, *by_walls[1:])
     if fits is None or fits[0].size_mm <= options.tolerance_mm:
         return None
-    moved, rival = fits
+    moved, *rivals = fits
     kinds = (slice(0, len(seen.place_mm)), slice(len(seen.place_mm), None))
     worth = np.concatenate([_worth(moved.log_density[one], patch[one]) for one in kinds])
+    rival = max(rivals, key=lambda fit: float(worth @ fit.log_density))
     gain = np.bincount(patch, worth * (moved.log_density - rival.log_density))
     spread = max(float(gain.std(ddof=1)) / np.sqrt(len(gain)), 1e-12)
-    if float(stdtr(len(gain) - 1, -gain.mean() / spread)) > options.spread_level:
+    if float(stdtr(len(gain) - 1, -gain.mean() / spread)) > options.false_alarm:
         return None
     p_value = float(_moves_as_far(seen, moved.size_mm) * np.exp(-gain.sum()))
     if p_value > options.false_alarm:
@@ -350,18 +349,23 @@ def layer_shift(
 
 def _fits(
     seen: _Seen, by_walls: int, walls_move: Float[np.ndarray, " 4"]
-) -> tuple[_Fit, _Fit] | None:
-    """The best explanations with and without a move; walls alone tell one, from some layer on.
+) -> tuple[_Fit, ...] | None:
+    """The best explanation with a move, and then those without; walls alone tell one to begin with.
 
-    None where a part of the points tells that the move explains no more than as many moves do by
-    chance.
+    Without a move the part may lie as the best one says that the upper layers do, or the lower
+    ones: what damage adds to the sum in a few places has pulled neither of them away. None where a
+    part of the points tells that the move explains no more than as many moves do by chance.
     """
     some = seen.some(seen.options.second_points)
     first = _moved(some, by_walls, walls_move)
     if first.total - _unmoved(some).total < np.log(_moves_as_far(seen, first.size_mm)):
         return None
     moved = _best_layer(seen, _climbed(seen, first.layer, first.move, _MOVES_AROUND))
-    return _climbed(seen, moved.layer, moved.move, _MOVES_AROUND), _unmoved(seen)
+    moved, rival = _climbed(seen, moved.layer, moved.move, _MOVES_AROUND), _unmoved(seen)
+    as_upper, as_lower = (
+        seen.fitted(rival.layer, np.tile(one, 2))[0] for one in (moved.move[:2], moved.move[2:])
+    )
+    return moved, rival, as_upper, as_lower
 
 
 def _moves_as_far(seen: _Seen, size_mm: float) -> float:

@@ -111,7 +111,7 @@ class Course:
         if self.line_of is None:
             return line
         if line >= len(self.line_of):
-            return self.job.program.text.count("\n")
+            return self.job.program.line_count
         return int(self.line_of[line])
 
     def stop(self, stop: Stop) -> Stop | None:

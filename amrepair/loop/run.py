@@ -104,7 +104,7 @@ def run_loop(
                 break
             ahead.seen(stop, trouble=had_trouble(run.report().at_stop(stop)))
         else:
-            run.print_job(checked.program.text.count("\n"))
+            run.print_job(checked.program.line_count)
         run.end()
     except TapeEndsError:
         pass

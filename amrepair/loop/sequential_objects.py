@@ -37,7 +37,7 @@ def finished_at(job: Job, turn: Turn, setup: PrintSetup) -> Finished | None:
     standing = standing_field(beads, turn.first_line, machine)
     parts = ~of_roles(beads, BESIDE_THE_PART) & (beads.layer >= 0)
     theirs, own = (
-        standing_field(beads.subset(parts & pick), job.program.text.count("\n"), machine).z_mm > 0
+        standing_field(beads.subset(parts & pick), job.program.line_count, machine).z_mm > 0
         for pick in (beads.layer < turn.first_layer, job.laid_in(turn))
     )
     if (theirs & own).sum() > LEAST_SHARE * own.sum():

@@ -65,14 +65,14 @@ def decide_look(
             objects=objects,
         )
     )
-    laid_nothing = _laid_nothing(here, plan, policy)
+    stuck, laid_nothing = _by_last_repair(here, plan, policy)
     left = buried(pieces_of(plan, here), stop, plan.layer_height_mm, policy)
     situation = Situation(
         gravest=gravest(verdicts),
         seen_twice=seen_twice,
         refused=plan.checked is None,
         last_pass=sum(look.printed for look in here) >= policy.most_passes,
-        stuck=_stuck(here, plan, policy) and not laid_nothing,
+        stuck=stuck,
         laid_nothing=laid_nothing,
         little_left=_done(here, plan, policy),
         beyond="" if limits is None else _beyond(plan, limits),
@@ -92,31 +92,22 @@ def decide_look(
     return replace(decision, reason=reason, ways=ways(left, job, stop, site.setup))
 
 
-def _stuck(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
-    """Whether the last repair at this stop changed next to nothing of what it was to fill."""
-    repair = _last_repair(here)
+def _by_last_repair(
+    here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions
+) -> tuple[bool, bool]:
+    """Of the last repair at this stop, whether it changed next to nothing, and laid nothing."""
+    repair = next((look.plan for look in reversed(here) if look.printed), None)
     if repair is None:
-        return False
+        return False, False
     before = repair.deficit.missing
-    return is_stuck(before.volume(), _left_in_place_mm3(before, plan.deficit.missing), policy)
-
-
-def _laid_nothing(here: Sequence[Look], plan: RepairPlan, policy: PolicyOptions) -> bool:
-    """Whether nothing rose where the last repair at this stop was laid (`is_laid_nothing`)."""
-    repair = _last_repair(here)
-    if repair is None or repair.patch is None:
-        return False
-    before = repair.deficit.missing
+    before_mm3, left_mm3 = before.volume(), _left_in_place_mm3(before, plan.deficit.missing)
+    if repair.patch is None:
+        return is_stuck(before_mm3, left_mm3, policy), False
     # what was laid where nothing was missing stands out there
     stands_mm3, stood_mm3 = (_over_mm3(before, one.deficit.excess) for one in (plan, repair))
-    filled_mm3 = before.volume() - _left_in_place_mm3(before, plan.deficit.missing)
-    risen_mm3 = filled_mm3 + max(stands_mm3 - stood_mm3, 0.0)
-    return is_laid_nothing(before.volume(), repair.patch.reachable_mm3, risen_mm3, policy)
-
-
-def _last_repair(here: Sequence[Look]) -> RepairPlan | None:
-    """The plan that was printed last at this stop; None where none was."""
-    return next((look.plan for look in reversed(here) if look.printed), None)
+    risen_mm3 = before_mm3 - left_mm3 + max(stands_mm3 - stood_mm3, 0.0)
+    laid_nothing = is_laid_nothing(before_mm3, repair.patch.reachable_mm3, risen_mm3, policy)
+    return is_stuck(before_mm3, left_mm3, policy) and not laid_nothing, laid_nothing
 
 
 def _over_mm3(missing: manifold3d.Manifold, excess: manifold3d.Manifold) -> float:

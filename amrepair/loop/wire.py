@@ -59,7 +59,7 @@ class Wire:
         """
         if self._tape.only_read:
             return None
-        end = checked.program.text.count("\n") if end is None else end
+        end = checked.program.line_count if end is None else end
         done, report = self._begin(Sent(kind, checked, first, end, done=False), progress)
         if done is not None:
             return report_from_json(done["report"])
@@ -98,7 +98,7 @@ class Wire:
             If nothing is felt; the heaters are off then.
         """
         printer = touching(self._printer)
-        end = checked.program.text.count("\n")
+        end = checked.program.line_count
         done, _ = self._begin(Sent(TOUCH, checked, 0, end, done=False))
         if done is not None:
             for _ in done["met_mm"]:

@@ -158,17 +158,17 @@ class GuardedConversation(SerialConversation):
         try:
             if not (ours and self._comes_to_rest() and self._switched_off()):
                 self._go_past()
-            self._safe_after, self._half_safe = self._bytes_sent, False
+            self._safe_after = self._bytes_sent
         except KeyboardInterrupt:  # in the midst of this: once more, past everything
             self._go_past()
             self._half_safe = False
             raise
         except (LinkError, LocalProtocolError, OSError) as error:
-            self._half_safe = False
             self._told_safe(f"HEATERS COULD NOT BE REACHED ({error}): switch the printer off")
         finally:
             if ours:
                 self._mutex.release()
+        self._half_safe = False
 
     def _comes_to_rest(self) -> bool:
         """Hear out what is under way, unless that takes minutes; whether nothing is left of it."""

@@ -76,8 +76,7 @@ class PortLock:
             with contextlib.suppress(OSError):
                 if self._is_named(self.fd):
                     self._path.unlink()
-            os.close(self.fd)
-            self.fd = None
+        self.hand_over()
 
     def hand_over(self) -> None:
         """Leave the lock to the supervisor, which has inherited it: nobody comes in between."""

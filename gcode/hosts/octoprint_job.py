@@ -322,8 +322,6 @@ class OctoPrintJob(ServedJob[OctoPrintSession], OctoPrintPrinter):
         if self._rest_anew is not None:
             return
         lines = [
-            text
-            for one in way_back
-            for _, text in commands_of(one, 0, one.program.text.count("\n"))
+            text for one in way_back for _, text in commands_of(one, 0, one.program.line_count)
         ]
         self._tell("leave", lines=lines)

@@ -124,7 +124,7 @@ class _Resumption:
         self._anew = anew
         self._release_c, self._pose_confirmed = release_c, pose_confirmed
         self._now_s = wall_clock()
-        self._total = checked.program.text.count("\n") + 1 if end is None else end
+        self._total = checked.program.line_count + 1 if end is None else end
         self._journal, self._job = self._last_job()
         self._silence_s = 0.0
         self._left_alone = False

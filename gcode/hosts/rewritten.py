@@ -53,7 +53,7 @@ class Rewritten:
     @property
     def total(self) -> int:
         """Lines of the program."""
-        return self.checked.program.text.count("\n")
+        return self.checked.program.line_count
 
     def ours(self, line: int) -> int:
         """The program's line for one of the job's."""

@@ -118,7 +118,7 @@ class SerialPrinter(GuardedConversation):
         if self._serial is None:
             raise LocalProtocolError("The printer is not connected; call connect() first.")
         require_arcs(checked, self.capabilities)
-        total = checked.program.text.count("\n") + 1
+        total = checked.program.line_count + 1
         first, end = (0, total) if lines is None else (lines.start, lines.stop)
         start_s = self._clock()
         before = (self._link.resends, self._stalls, self._link.spare_oks, self._bytes_sent)

@@ -169,7 +169,7 @@ class ServedJob(ServerPrinter[Session]):
         LinkError
             If it is another.
         """
-        if checked.program.text.count("\n") != self._text.lines:
+        if checked.program.line_count != self._text.lines:
             raise LinkError(f"{self._name} on {self.address.name} is not the file that was read.")
         self._sha256 = checked.program.sha256
 
@@ -205,7 +205,7 @@ class ServedJob(ServerPrinter[Session]):
         """Have the server print on to a look of the job, or print a program of ours at one."""
         require_checked(checked)
         start_s = self._clock()
-        lines = range(checked.program.text.count("\n")) if lines is None else lines
+        lines = range(checked.program.line_count) if lines is None else lines
         ok, end = True, lines.stop
         anew = self._rest_anew
         if checked.program.sha256 == self._sha256:

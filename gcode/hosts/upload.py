@@ -35,7 +35,7 @@ class JobFile:
     @classmethod
     def of(cls, checked: PrintableProgram, lines: range | None) -> JobFile:
         """Cut the file out of a program."""
-        total = checked.program.text.count("\n") + 1
+        total = checked.program.line_count + 1
         first, end = (0, total) if lines is None else (lines.start, lines.stop)
         rows = checked.lines(first, end)
         text = "\n".join(rows)

@@ -145,7 +145,7 @@ def _pieces(
     later = np.flatnonzero(job.beads.line >= first)
     kept, lines = ~given_up[later], job.beads.line[later]
     pieces: list[tuple[int, int, bool]] = []
-    at, end = first, job.program.text.count("\n")
+    at, end = first, job.program.line_count
 
     def gap(until: int) -> None:
         bounds = [at, *(s for s in sorted(stops) if at < s < until), until]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from amrepair.loop.findings import _whole_defects
-from amrepair.loop.situation import _laid_nothing, _stuck
+from amrepair.loop.situation import _by_last_repair
 from amrepair.policy import DEFAULT_POLICY
 from amrepair.policy.table import (
     FINDINGS,
@@ -155,7 +155,8 @@ def test_a_repair_is_stuck_where_it_leaves_what_it_was_to_fill(
 ) -> None:
     last = SimpleNamespace(printed=True, plan=plan_of(CUBE((8.0, 2.0, 0.2))))
     now = plan_of(CUBE(size_mm).translate(left_at_mm))
-    assert _stuck([last], now, DEFAULT_POLICY) is tells_stuck  # type: ignore[list-item]
+    stuck, _ = _by_last_repair([last], now, DEFAULT_POLICY)  # type: ignore[list-item]
+    assert stuck is tells_stuck
 
 
 GROOVE_MM3 = 8.0 * 2.0 * 0.2
@@ -182,17 +183,17 @@ def test_a_repair_of_which_nothing_rose_is_known_by_its_balance(
     before = plan_of(CUBE((8.0, 2.0, 0.2)), laid_mm3=filled_ratio * GROOVE_MM3)
     looks: list[Any] = [SimpleNamespace(printed=True, plan=before)]
     now = plan_of(CUBE((left_mm, 2.0, 0.2)), excess=on_top)
-    assert _laid_nothing(looks, now, DEFAULT_POLICY) is tells
+    assert _by_last_repair(looks, now, DEFAULT_POLICY)[1] is tells
     # a second look at what the same repair has left tells the same
     looks.append(SimpleNamespace(printed=False, plan=now))
-    assert _laid_nothing(looks, now, DEFAULT_POLICY) is tells
+    assert _by_last_repair(looks, now, DEFAULT_POLICY)[1] is tells
 
 
 def test_where_nothing_was_printed_yet_no_repair_has_failed() -> None:
     now = plan_of(CUBE((8.0, 2.0, 0.2)))
     looks: list[Any] = [SimpleNamespace(printed=False, plan=now)]
-    assert not _laid_nothing([], now, DEFAULT_POLICY)
-    assert not _laid_nothing(looks, now, DEFAULT_POLICY)
+    assert _by_last_repair([], now, DEFAULT_POLICY) == (False, False)
+    assert _by_last_repair(looks, now, DEFAULT_POLICY) == (False, False)
 
 
 def test_nothing_is_printed_on_after_a_repair_of_which_nothing_rose() -> None:
