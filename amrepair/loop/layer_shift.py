@@ -25,6 +25,8 @@ from jaxtyping import Float
 from scipy.special import ndtri, stdtr
 
 from amrepair.arrays import Numbers, Points, Values
+from amrepair.field.groups import cell_numbers
+from amrepair.frames import cells_of
 from amrepair.loop import layer_shift_kernels as kernels
 from gcode.reader import Job
 from gcode.surfaces.lines import heights_by_lines
@@ -438,9 +440,7 @@ def _layers(first: int, last: int, options: ShiftOptions) -> list[int]:
 def _patches(seen: _Seen, patch_mm: float) -> Numbers:
     """Of each point, walls after tops, the number of its patch."""
     place_mm = np.concatenate([seen.place_mm, seen.walls.place_mm])
-    cell = np.floor(place_mm / patch_mm).astype(np.int64)
-    _, number = np.unique(cell, axis=0, return_inverse=True)
-    return np.asarray(number.reshape(-1))
+    return cell_numbers(cells_of(place_mm, 0.0, patch_mm))
 
 
 def _worth(log_density: Values, patch: Numbers) -> Values:

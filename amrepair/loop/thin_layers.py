@@ -20,7 +20,8 @@ from jaxtyping import Bool, Float
 from scipy.special import stdtrit
 
 from amrepair.arrays import Mask, Points, Values
-from amrepair.frames import in_box, unit_vectors
+from amrepair.field.groups import cell_numbers
+from amrepair.frames import cells_of, in_box, unit_vectors
 from amrepair.loop.looks import Look, Stop
 from amrepair.observe.robust import sigma_by_median
 from amrepair.regions import Label
@@ -262,10 +263,10 @@ class _Walls:
         wall[wall] = np.abs(deviation_mm[wall]) < width_mm[layer[wall]]
         layer, way = layer[wall], outward[wall, :2]
         quarter = np.round(np.arctan2(way[:, 1], way[:, 0]) / (0.5 * np.pi)).astype(np.int64) % 4
-        cell = np.floor(place_mm[wall, :2] / options.patch_mm).astype(np.int64)
-        _, patch = np.unique(np.column_stack([cell, quarter]), axis=0, return_inverse=True)
+        cell = cells_of(place_mm[wall, :2], 0.0, options.patch_mm)
+        patch = cell_numbers(np.column_stack([cell, quarter]))
         shape = (int(patch.max(initial=-1)) + 1, len(tops_mm))
-        of = patch.reshape(-1) * shape[1] + layer
+        of = patch * shape[1] + layer
         count, total_mm = (
             np.bincount(of, weights=weights, minlength=shape[0] * shape[1]).reshape(shape)
             for weights in (None, -deviation_mm[wall])

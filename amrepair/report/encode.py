@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 
 from amrepair.align.thinning_kernels import morton_keys
 from amrepair.arrays import Numbers, Points
+from amrepair.field.groups import cell_numbers
+from amrepair.frames import cells_of
 from amrepair.report.data import SolidMesh
 from amrepair.report.options import DEFAULT_PAGE
 
@@ -160,9 +162,7 @@ def _clustered(mesh: SolidMesh, budget: int) -> SolidMesh:
     extent_mm = float((mesh.vertices_mm.max(axis=0) - low).max())
     cell_mm = extent_mm / 512
     while True:
-        cell = np.floor((mesh.vertices_mm - low) / max(cell_mm, 1e-9)).astype(np.int64)
-        _, group = np.unique(cell, axis=0, return_inverse=True)
-        group = group.reshape(-1)
+        group = cell_numbers(cells_of(mesh.vertices_mm, low, max(cell_mm, 1e-9)))
         faces = group[mesh.faces]
         alive = (
             (faces[:, 0] != faces[:, 1])

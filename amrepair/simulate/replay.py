@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from amrepair.arrays import Numbers, PlanePoints, Points, Values, Vector
+from amrepair.field.groups import cell_numbers
 from amrepair.frames import unit_vectors
 from amrepair.simulate.options import DEFAULT_REPLAY
 from amrepair.simulate.recording import Recording, edge_distance_mm
@@ -118,8 +119,7 @@ class Replay:
         """(n,) recorded residuals for points of an image plane, by incidence and edges."""
         by_edge = (edge_mm < DEFAULT_REPLAY.spot_edge_mm).astype(np.int64)
         shifted = (plane_mm - plane_mm.min(axis=0)) / DEFAULT_REPLAY.block_mm + rng.random(2)
-        _, block = np.unique(np.floor(shifted).astype(np.int64), axis=0, return_inverse=True)
-        block = block.ravel()
+        block = cell_numbers(np.floor(shifted).astype(np.int64))
         count = np.bincount(block)
         wanted = _Blocks(
             np.stack([np.bincount(block, plane_mm[:, k]) / count for k in range(2)], axis=1),
