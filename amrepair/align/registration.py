@@ -62,6 +62,16 @@ class Registration:
         """
         return bounded_inverse(self.information, UNKNOWN_INFORMATION_RATIO)
 
+    def to_json(self) -> dict[str, object]:
+        """As results have it."""
+        return {
+            "template_from_scan": self.template_from_scan.matrix.tolist(),
+            "rmse_mm": self.rmse_mm,
+            "inlier_ratio": self.inlier_ratio,
+            "clutter_ratio": self.clutter_ratio,
+            "symmetric_alternatives": [t.matrix.tolist() for t in self.symmetric_alternatives],
+        }
+
 
 def bounded_inverse(
     information: Float[np.ndarray, "n n"], free_ratio: float

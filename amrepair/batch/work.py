@@ -204,14 +204,9 @@ def _refused(task: Task, sentence: str) -> TaskOutcome:
     return TaskOutcome(task.scan_id, sentence=sentence, lasting=False)
 
 
-def _pose_figures(found: Registration) -> dict[str, Any]:
-    return {
-        "template_from_scan": found.template_from_scan.matrix.tolist(),
-        "rmse_mm": found.rmse_mm,
-        "inlier_ratio": found.inlier_ratio,
-        "clutter_ratio": found.clutter_ratio,
-        "symmetric_alternatives": len(found.symmetric_alternatives),
-    }
+def _pose_figures(found: Registration) -> dict[str, object]:
+    """As results have it, but how many other poses fit as well, and not which."""
+    return found.to_json() | {"symmetric_alternatives": len(found.symmetric_alternatives)}
 
 
 def _found(

@@ -105,7 +105,7 @@ def align(
                 console.write_whole(output, lambda path: write_ply(moved, path))
     # Other programs take the pose as input, so that it keeps all digits.
     result: dict[str, Any] = {
-        **_pose_figures(found),
+        **found.to_json(),
         "covariance": found.covariance.tolist(),
         "method": found.method,
         "iterations": found.iterations,
@@ -146,17 +146,6 @@ def _laid(
     field, rng = open_template(template, progress=bars), np.random.default_rng(seed)
     with watch("align"):
         return field, align(cloud, field, method=method, rng=rng, progress=bars, **how), {}
-
-
-def _pose_figures(found: Registration) -> dict[str, Any]:
-    """Where a scan lies, as results record it."""
-    return {
-        "template_from_scan": found.template_from_scan.matrix.tolist(),
-        "rmse_mm": found.rmse_mm,
-        "inlier_ratio": found.inlier_ratio,
-        "clutter_ratio": found.clutter_ratio,
-        "symmetric_alternatives": [t.matrix.tolist() for t in found.symmetric_alternatives],
-    }
 
 
 def _say_clutter(found: Registration) -> None:
@@ -272,7 +261,7 @@ def detect(
             for region in regions
         ],
         **_told(anomaly, calibration),
-        **_pose_figures(found),
+        **found.to_json(),
         "seconds": watch.rounded_s(),
         **chosen,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -48,13 +48,8 @@ class MotionBatch:
         if not batches:
             none3, none1 = np.zeros((0, 3)), np.zeros(0)
             return cls(none3, none3, none1, none1, none1)
-        return cls(
-            np.concatenate([batch.start_mm for batch in batches]),
-            np.concatenate([batch.end_mm for batch in batches]),
-            np.concatenate([batch.filament_mm for batch in batches]),
-            np.concatenate([batch.speed_mm_s for batch in batches]),
-            np.concatenate([batch.time_s for batch in batches]),
-        )
+        rows = ([getattr(batch, each.name) for batch in batches] for each in fields(cls))
+        return cls(*(np.concatenate(each) for each in rows))
 
 
 class MotionFile:
