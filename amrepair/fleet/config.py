@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from amrepair.errors import InputError
 from gcode.errors import ProfileError
 from gcode.profiles import DEFAULT_MATERIAL, DEFAULT_PRINTER, DEFAULT_PROCESS
+from gcode.profiles.names import is_path
 from gcode.profiles.store import read_toml, validated
 
 _PRINTER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -117,10 +118,13 @@ def read_config(path: Path) -> FleetConfig:
 
 def _beside(spec: PrinterSpec, base: Path) -> PrinterSpec:
     """With its paths from a folder on."""
-    where = {"job": base / spec.job, "template": base / spec.template}
-    watched = spec.scanner.removeprefix("watch:")
-    scanner = spec.scanner if watched == spec.scanner else f"watch:{base / watched}"
-    return spec.model_copy(update={**where, "scanner": scanner})
+    kind, _, where = spec.scanner.partition(":")
+    files: dict[str, Path | str] = {"job": base / spec.job, "template": base / spec.template}
+    files["scanner"] = f"{kind}:{base / where}" if where else spec.scanner
+    for key in ("printer", "material", "process"):
+        named = getattr(spec, key)
+        files[key] = str(base / named) if is_path(named) else named
+    return spec.model_copy(update=files)
 
 
 def _refuse_twice(path: Path, values: list[str], what: str) -> None:

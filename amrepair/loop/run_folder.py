@@ -32,6 +32,7 @@ from amrepair.template.port import Template
 from gcode.check import CheckedProgram, check, policy_of
 from gcode.meshes import mesh_of
 from gcode.profiles import PrintSetup, ProcessProfile, load_setup
+from gcode.profiles.names import is_path
 from gcode.reader import Job, job_for
 from gcode.surfaces.sizes import in_words
 from gcode.whole import write_bytes
@@ -317,7 +318,7 @@ def forget(folder: Path) -> None:
 
 def _whole(name: str) -> str:
     """A profile's name; a path is kept from wherever it is read again."""
-    return str(Path(name).resolve()) if name.endswith(".toml") or "/" in name else name
+    return str(Path(name).resolve()) if is_path(name) else name
 
 
 def _matrix(rows: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:

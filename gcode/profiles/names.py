@@ -26,6 +26,11 @@ def list_profiles(kind: Kind) -> tuple[str, ...]:
     return tuple(sorted(id_of(path) for path in (profile_dir() / kind).glob("*.toml")))
 
 
+def is_path(name: str) -> bool:
+    """Whether a profile is named by its file, and not by its ID."""
+    return name.endswith(".toml") or "/" in name
+
+
 def id_of(path: Path) -> str:
     """A profile's ID: its file's name without the ending."""
     return path.name.removesuffix(".toml")

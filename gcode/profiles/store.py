@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from gcode.errors import ProfileError
-from gcode.profiles.names import Kind, id_of, list_profiles, profile_dir
+from gcode.profiles.names import Kind, id_of, is_path, list_profiles, profile_dir
 from gcode.profiles.own_limits import own_fault
 from gcode.profiles.schema import MaterialProfile, PrinterProfile, ProcessProfile
 
@@ -66,7 +66,7 @@ def kind_of(id_or_path: str | Path) -> Kind:
     named: list[Kind] = [kind for kind in MODELS if text in list_profiles(kind)]
     if len(named) == 1:
         return named[0]
-    if not (text.endswith(".toml") or "/" in text):
+    if not is_path(text):
         several = f"is a profile of several kinds ({', '.join(named)}); say which"
         nothing = (
             "is no profile; 'gcode profiles list' names them, a file of your own ends in .toml"
@@ -90,7 +90,7 @@ def kind_of(id_or_path: str | Path) -> Kind:
 def _find(kind: Kind, id_or_path: str | Path, beside: Path | None = None) -> Path:
     """The file that an ID or a path means."""
     text = str(id_or_path)
-    if text.endswith(".toml") or "/" in text:
+    if is_path(text):
         path = Path(text)
         if beside is not None and not path.is_absolute():
             path = beside / path

@@ -46,6 +46,27 @@ def test_a_file_is_read_with_paths_beside_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("key", "said", "meant"),
+    [
+        ("scanner", "python:camera.py", "python:{}/camera.py"),
+        ("scanner", "simulated:motion.bin", "simulated:{}/motion.bin"),
+        ("scanner", "probe", "probe"),
+        ("printer", "own.toml", "{}/own.toml"),
+        ("printer", "prusa_mk3s", "prusa_mk3s"),
+    ],
+)
+def test_whatever_names_a_file_is_beside_it(
+    tmp_path: Path, key: str, said: str, meant: str
+) -> None:
+    # regression: of a scanner's own file and of own profiles it was not, though the page says so
+    path = config_file(tmp_path, ("a", "/dev/a"))
+    text = re.sub(f"{key} = .*\n", "", path.read_text())
+    path.write_text(f'{text}\n{key} = "{said}"\n')
+    (spec,) = read_config(path).printers
+    assert getattr(spec, key) == meant.format(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         ("", "has no printer"),
