@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
 from amrepair.arrays import Box, Points, Values
+from amrepair.field.groups import cell_numbers
+from amrepair.frames import cells_of
 from amrepair.observe.robust import sigma_by_median
 from amrepair.policy import DEFAULT_POLICY
 from amrepair.repair import RepairPlan
@@ -95,13 +97,12 @@ class LayerLevel:
         )
         if not top.any():
             return None
-        patch = np.floor(place_mm[top, :2] / options.patch_mm).astype(np.int64)
-        low, shape = patch.min(axis=0), np.ptp(patch, axis=0) + 1
-        of = (patch[:, 0] - low[0]) * shape[1] + patch[:, 1] - low[1]
-        count, total_mm = np.bincount(of), np.bincount(of, weights=over[top])
-        seen = np.flatnonzero(count)
-        cell = np.stack(np.divmod(seen, shape[1]), axis=1) + low
-        count, mean = count[seen], total_mm[seen] / count[seen]
+        patch = cells_of(place_mm[top, :2], 0.0, options.patch_mm)
+        of = cell_numbers(patch)
+        count = np.bincount(of)
+        mean = np.bincount(of, weights=over[top]) / count
+        cell = np.empty((len(count), 2), np.int64)
+        cell[of] = patch
         many = count >= options.least_points
         if many.sum() < options.least_patches:
             return None
