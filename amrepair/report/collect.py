@@ -84,9 +84,12 @@ def rounded(value: Any) -> Any:
 
 
 def region_rows(plan: RepairPlan) -> tuple[RegionRow, ...]:
-    """The regions of one look, with what is known of reaching them."""
-    rows = []
-    for region in plan.deficit.regions:
+    """The regions of one look, with what is known of reaching them.
+
+    Crumbs of less than a bead are no defects beside larger ones; their volume is in the sums.
+    """
+    rows, regions = [], plan.deficit.regions
+    for region in [region for region in regions if not region.below_bead] or regions:
         note, reach = "", None
         if region.label is Label.EXCESS:
             note = _NOTE_EXCESS
