@@ -146,8 +146,8 @@ class RegionOptions:
     registration_sigma_mm
         Standard deviation of the alignment, at the surface.
     process_sigma_mm
-        By how much the surface of sound parts of this process wanders, as a profile or a
-        calibration knows it. With 0 all wander counts as the scanner's.
+        By how much the surface of sound parts of this process wanders, as a profile knows it: taken
+        off what a calibration tells. A scan alone does not tell the two apart.
     widest_mm
         The widest windows of local means. Errors of desktop and laser scanners are correlated over
         2 to 10 mm, so that wider means gain nothing.

@@ -6,10 +6,10 @@ of false regions is shared out over scales, signs and windows.
 
 The standard error of a mean comes from the scan itself and has two parts. One is independent from
 cell to cell, and neighbouring cells tell it by their differences. The other is common to a whole
-window, the wander, and windows far apart tell it by theirs, less what the process is known to
-leave. Only few places are so far apart that their errors are independent, so a deviation divided by
-this standard error is distributed as Student's t rather than normally. Where several views saw a
-window they tell its common part, too, by how much they differ (`between_views`).
+window, the wander, and windows far apart tell it by theirs. Only few places are so far apart that
+their errors are independent, so a deviation divided by this standard error is distributed as
+Student's t rather than normally. Where several views saw a window they tell its common part, too,
+by how much they differ (`between_views`).
 
 Real scanners leave more outliers than that. Where more places exceed the tolerance than can be
 real, their peaks tell the tail of the errors (Efron 2004, by peaks over a threshold); what stands
@@ -18,7 +18,7 @@ out even from that tail is a defect.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +95,9 @@ class Tail:
         return self.start + min(told, self.longest * float(np.log(ratio)))
 
 
+NO_TAIL = Tail(0.0, 0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Errors:
     """Standard errors at one scale.
@@ -103,8 +106,9 @@ class Errors:
     ----------
     cell_mm, window_mm
         (s,) independent part of the standard error of a cell's value, and of a window's median.
-    common_mm
-        (s,) part of the standard error that all cells of a window share.
+    common_mm, most_common_mm
+        (s,) part of the standard error that all cells of a window share; and if nothing of what
+        windows wander by were the process's.
     wander_mm, freedom
         (c,) standard deviation of window means, for each class of how well windows were seen, and
         the degrees of freedom of its estimate.
@@ -117,6 +121,7 @@ class Errors:
     cell_mm: Values
     window_mm: Values
     common_mm: Values
+    most_common_mm: Values
     wander_mm: Float[np.ndarray, " c"]
     freedom: Float[np.ndarray, " c"]
     group: Numbers
@@ -133,16 +138,30 @@ class Errors:
         ratio = float(np.median(self.window_mm)) / float(np.median(whole))
         return 1.0 + (RANK - 1) * ratio**2
 
-    def freedom_of(self, error_mm: Values) -> Values:
-        """(s,) degrees of freedom of standard errors that contain the wander.
+    def of(self, own_mm: Values, quantile: float) -> tuple[Values, Values]:
+        """(s,) standard errors of a statistic with such an independent part, and their freedom.
+
+        What the process is known to leave is taken off what windows wander by. The less is left,
+        the less certain it is, and at most it is all of the wander: of the two, the one counts that
+        believes more of a window at this quantile.
+        """
+        less, whole = (self._with(own_mm, each) for each in (self.common_mm, self.most_common_mm))
+        surer = as_student(quantile, less[1]) * less[0] <= as_student(quantile, whole[1]) * whole[0]
+        error_mm, freedom = (np.where(surer, *both) for both in zip(less, whole, strict=True))
+        return error_mm, freedom
+
+    def _with(self, own_mm: Values, common_mm: Values) -> tuple[Values, Values]:
+        """(s,) standard errors with such a common part, and their degrees of freedom.
 
         Only the variance of the wander is uncertain (Satterthwaite 1946). Where the wander adds
         nothing to the independent part, the standard error counts as known: infinite.
         """
-        wander = np.where(self.common_mm > 0.0, self.wander_mm[self.group], 0.0)
-        share = np.minimum(wander / error_mm, 1.0) ** 4
+        error_mm = np.hypot(own_mm, common_mm)
+        wander_mm = np.where(common_mm > 0.0, self.wander_mm[self.group], 0.0)
+        share = (wander_mm / error_mm) ** 4
         known = np.full(len(share), np.inf)
-        return np.divide(self.freedom[self.group], share, out=known, where=share > 0.0)
+        np.divide(self.freedom[self.group], share, out=known, where=share > 0.0)
+        return error_mm, known
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +190,8 @@ class Level:
         (2, s) natural logarithm of the expected number of false regions at least as high.
     peaks
         The highest z of each group of windows beyond the tolerance.
+    tail
+        How the peaks of sound places fall off.
     """
 
     scale: Scale
@@ -185,6 +206,7 @@ class Level:
     quantile: float
     log_p: Float[np.ndarray, "2 s"]
     peaks: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]
+    tail: Tail
 
     @property
     def rejected(self) -> Bool[np.ndarray, "2 s"]:
@@ -256,7 +278,7 @@ def tested(
     )
     said = Said.of(inspected)
     share = options.false_regions / (2 * (len(scales) + 1))
-    levels = []
+    levels: list[Level] = []
     for k, scale in enumerate(scales):
         size = np.maximum(np.bincount(scale.of_base, minlength=len(scale)), 1)
         cells = [
@@ -282,11 +304,13 @@ def tested(
         means = np.stack([-scale.median_mm, scale.median_mm])
         thirds = np.stack([-scale.low_mm, scale.high_mm])
         for statistic, sides, errors in ((0, thirds, by_cells), (1, means, by_means))[k > 0 :]:
+            narrower = levels[-1].tail if levels else NO_TAIL
             levels.append(
                 _level(
-                    scale, judged, sides, allowed_mm, errors, share, options, calibration, statistic
+                    scale, judged, sides, allowed_mm, errors, share, options, calibration,
+                    statistic, narrower,
                 )
-            )
+            )  # fmt: skip
     return tuple(levels)
 
 
@@ -342,13 +366,20 @@ def _errors(
     aslant = 1.0 if calibration is None else np.maximum(calibration.facing / facing, 1.0)
     few = min(options.least_cells, len(facing)) - 1
     least = float(np.partition(facing, few)[few])
-    by_wander = (wander[group] * aslant) ** 2 - options.process_sigma_mm**2
+    by_wander = (wander[group] * aslant) ** 2
+    # a scan alone does not tell its own errors from what the process left
+    process_mm = 0.0 if calibration is None else options.process_sigma_mm
     found = []
     for seen_by, pose_mm in zip((views.cell_by, views.window_by), poses_mm, strict=True):
         by_views = np.maximum(views.one_mm**2 / seen_by, np.square(views.here_mm))
-        errs = np.maximum(by_wander, by_views) - window**2
-        common = np.sqrt(np.maximum(errs, 0.0) + pose_mm**2)
-        found.append(Errors(cell, window, common, wander, freedom, group, least))
+        common, most = (
+            np.sqrt(
+                np.maximum(np.maximum(by_wander - process_mm2, by_views) - window**2, 0.0)
+                + pose_mm**2
+            )
+            for process_mm2 in (process_mm**2, 0.0)
+        )
+        found.append(Errors(cell, window, common, most, wander, freedom, group, least))
     return found[0], found[1]
 
 
@@ -444,26 +475,26 @@ def _level(
     options: RegionOptions,
     calibration: Calibration | None,
     statistic: int,
+    narrower: Tail,
 ) -> Level:
     """Standardise one statistic, and find from which value on it is significant.
 
     `judged` windows are tested, the others are not; `statistic` is 0 for the third lowest and
     highest cells, 1 for medians; `share` is the number of false regions that this level may cause
-    on one side.
+    on one side, and `narrower` the tail of the level before.
     """
     own_mm, together = (
         (errors.cell_mm, errors.independent) if statistic == 0 else (errors.window_mm, 1.0)
     )
-    error_mm = np.hypot(own_mm, errors.common_mm)
-    freedom = errors.freedom_of(error_mm)
-    beyond_mm = sides - tolerance_mm
-    z = as_normal(beyond_mm / error_mm, freedom)
-    z[:, ~judged] = -np.inf
     n = max(int(judged.sum()), 1)
     # the chance that r = `together` of the k cells of a window are all so far out: C(k, r) · Q^r
     usual = float(np.median(scale.count))
     ways = float(comb(usual, together)) if together > 1.0 and usual > together else 1.0
     quantile = -float(ndtri(min((share / (n * ways)) ** (1.0 / together), 0.5)))
+    error_mm, freedom = errors.of(own_mm, quantile)
+    beyond_mm = sides - tolerance_mm
+    z = as_normal(beyond_mm / error_mm, freedom)
+    z[:, ~judged] = -np.inf
     critical = np.full(2, quantile)
     if statistic == 0 and calibration is None:
         outlying = _outlying(scale, error_mm, tolerance_mm, options.one_sided)
@@ -474,21 +505,22 @@ def _level(
     far_off_mm = np.zeros(2)
     over = (z > options.tail_from) & ~scale.apart
     low, high = (_peaks(scale, *each) for each in zip(over, z, strict=True))
-    for side, peaks in enumerate((low, high)):
+    tail = NO_TAIL
+    if calibration is None:
+        tail = _tail(scale, over, z, (len(low), len(high)), narrower, options)
+    for side in (0, 1):
         if calibration is not None:
             width_mm = scale.width_mm if statistic else None
             far_off = calibration.far_off_in(width_mm, side, len(scale))
             log_p[side] = np.maximum(log_p[side], far_off.log_expected(beyond_mm[side]))
             far_off_mm[side] = far_off.exceeded_by(share)
-        elif _at_one_place(scale, over[side], len((high, low)[side]), options):
-            continue
-        elif (tail := _tail(peaks, options)).scale > 0:
+        elif tail.scale > 0:
             by_tail = np.maximum(log_p[side], tail.log_expected(safe[side]))
             log_p[side] = np.where(scale.apart, log_p[side], by_tail)
             critical[side] = max(critical[side], tail.exceeded_by(share))
     return Level(
         scale, errors, tolerance_mm, error_mm, freedom, beyond_mm, z, critical, far_off_mm,
-        quantile, log_p, (low, high),
+        quantile, log_p, (low, high), tail,
     )  # fmt: skip
 
 
@@ -528,23 +560,35 @@ def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
     return np.sort(peak[np.isfinite(peak)])
 
 
-def _at_one_place(scale: Scale, over: Mask, opposite: int, options: RegionOptions) -> bool:
-    """Whether the peaks of a side are a defect's, by the rules of `_outlying`.
+def _elsewhere(scale: Scale, over: Mask, opposite: int, options: RegionOptions) -> Mask:
+    """(s,) which windows of a side in `over` are no defect's, by the rules of `_outlying`.
 
-    A break is rough, and its windows are many peaks by themselves. They tell of a scanner's errors
-    only where enough of them lie elsewhere, or enough `opposite` ones on the other side.
+    A break is rough, and its windows are many peaks by themselves: those at the place that has the
+    most are left out, but for where enough `opposite` ones lie on the other side.
     """
-    if options.one_sided * (opposite + 1) >= LEAST_PEAKS:
-        return False
+    if options.one_sided * (opposite + 1) >= LEAST_PEAKS or not over.any():
+        return over
     which = np.flatnonzero(over)
     place = group_points(scale.place_mm[which], reach_mm=scale.width_mm)
     peaks = np.unique(np.column_stack([place, _groups(scale, over)[which]]), axis=0)
-    largest = int(np.bincount(peaks[:, 0], minlength=1).max())
-    return len(peaks) - largest < LEAST_PEAKS
+    elsewhere = over.copy()
+    elsewhere[which] = place != np.bincount(peaks[:, 0]).argmax()
+    return elsewhere
 
 
-def _tail(peaks: Values, options: RegionOptions) -> Tail:
-    """Fit an exponential tail to those peaks over the tolerance that are errors.
+def _tail(
+    scale: Scale,
+    over: Bool[np.ndarray, "2 s"],
+    z: Float[np.ndarray, "2 s"],
+    counts: tuple[int, int],
+    narrower: Tail,
+    options: RegionOptions,
+) -> Tail:
+    """Fit an exponential tail to the peaks over the tolerance that are errors, of both sides.
+
+    Errors lie on both sides of the template, so that either tells of the other's; what a defect
+    leaves at one place does not. `counts` is how many peaks each side has. Where too few tell of
+    errors, the `narrower` windows' do: means over more are no outliers more often.
 
     Which peaks are errors is found by a forward search, as in Kimber 1982. Peaks that even the
     longest tail would not reach are left out first. The lower half of the rest is taken for errors;
@@ -556,14 +600,20 @@ def _tail(peaks: Values, options: RegionOptions) -> Tail:
     def reach(count: int) -> float:
         return start + longest * float(np.log(max(count, 1) / options.false_regions))
 
-    while len(peaks) and peaks[-1] > reach(len(peaks)):
-        peaks = peaks[:-1]
-    if len(peaks) < LEAST_PEAKS:
-        return Tail(start, 0.0, *2 * (float(len(peaks)),))
-    beyond = peaks - start
+    elsewhere = (
+        _elsewhere(scale, mine, opposite, options)
+        for mine, opposite in zip(over, counts[::-1], strict=True)
+    )
+    both = [_peaks(scale, *each) for each in zip(elsewhere, z, strict=True)]
+    told = np.sort(np.concatenate(both))
+    while len(told) and told[-1] > reach(len(told)):
+        told = told[:-1]
+    if len(told) < LEAST_PEAKS:
+        return replace(narrower, peaks=max(float(len(told)), 1.0))
+    beyond = told - start
     for sound in range(len(beyond) // 2, len(beyond) + 1):
-        scale = min(float(beyond[:sound].mean()), longest)
-        tail = Tail(start, scale, float(sound), float(sound), longest)
-        if sound < len(beyond) and peaks[sound] > tail.exceeded_by(options.false_regions):
+        mean = min(float(beyond[:sound].mean()), longest)
+        tail = Tail(start, mean, float(sound), float(sound), longest)
+        if sound < len(beyond) and told[sound] > tail.exceeded_by(options.false_regions):
             break
     return tail

@@ -71,6 +71,16 @@ def test_errors_that_hang_together_raise_no_alarm(ball: AnalyticTemplate, seed: 
     assert found.told_over_mm(0.2) > 0.0  # of no line that is told as far as it is wide
 
 
+@pytest.mark.parametrize("lumps", [100, 115, 125])
+def test_a_scan_alone_does_not_tell_its_errors_from_what_the_process_left(
+    ball: AnalyticTemplate, lumps: int
+) -> None:
+    # regression: what a process usually leaves was taken off what windows wander by, and the little
+    # that was left made errors of a third of a millimetre significant
+    options = RegionOptions(process_sigma_mm=0.05)
+    assert detect(rough(ball, lumps), ball, options=options).regions == ()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_dent_among_such_errors_is_found_and_nothing_else(
     ball: AnalyticTemplate, seed: int
@@ -183,6 +193,29 @@ def test_a_rough_break_at_one_place_is_not_taken_for_errors_of_the_scan(seed: in
     points, _ = noisy_scan_points(rest, spacing_mm=0.4, sigma_mm=0.1, seed=seed)
     found = detect(Scan(points, 0.1, "template"), ring).regions
     assert {region.label for region in found} == {Label.MISSING}
+
+
+@pytest.mark.parametrize(("deep_mm", "told"), [(0.45, False), (1.5, True)])
+def test_errors_on_one_side_tell_of_those_on_the_other(deep_mm: float, told: bool) -> None:
+    # regression: a side with fewer than six peaks was taken for one without outliers, whatever the
+    # other side and narrower windows showed
+    rng = np.random.default_rng(0)
+    n, cell_mm = 120, 0.5
+    across, along = np.meshgrid(np.arange(n) * cell_mm, np.arange(n) * cell_mm, indexing="ij")
+    value_mm = rng.normal(0.0, 0.1, (n, n))
+    places = rng.permutation(25)[:13]
+    for k, high_mm in zip(places, [-deep_mm, *np.linspace(0.25, 0.45, 12)], strict=True):
+        row, column = 4 + 24 * (k // 5), 4 + 24 * (k % 5)
+        value_mm[row : row + 4, column : column + 4] += high_mm
+    inspected = Inspected(
+        cells=n * n, cell_mm=cell_mm,
+        place_mm=np.column_stack([across.ravel(), along.ravel(), np.zeros(n * n)]),
+        normal=np.tile([0.0, 0.0, 1.0], (n * n, 1)), value_mm=value_mm.ravel(),
+        weight=np.full(n * n, 4.0), tolerance_mm=np.full((2, n * n), 0.2),
+        facing=np.ones(n * n), pose_mm=np.zeros(n * n),
+    )  # fmt: skip
+    missing = [level.rejected[0].any() for level in levels_of(inspected, RegionOptions(), None)[1:]]
+    assert any(missing) is told
 
 
 def test_few_peaks_tell_a_tail_less_surely_than_many() -> None:
