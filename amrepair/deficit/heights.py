@@ -3,8 +3,8 @@
 The slicer lays beads onto it, and the checker keeps the head clear of it. A height is a robust mean
 of the topmost points in a column. A column that no ray reached counts as solid up to the printed
 height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points, the
-part is taken to stand as designed, with that margin, and nothing where it was designed open. So it
-is beside a part to which somebody has cut its scan, sensors or not.
+part is taken to stand as designed, with that margin, and nothing where it was designed open. Nor
+can one that somebody has cut to its part: rays that ended on the bed beside it are gone.
 """
 
 from __future__ import annotations
@@ -65,16 +65,14 @@ def as_built_heights(
     solid_z = np.full(grid.shape, top_z + options.unseen_margin_mm)
     z, seen = _tops(points, grid, spacing_mm, options)
     known = seen
-    cut = scan.sensors_mm is not None and _is_cut_to(box, grid, seen, options)
-    if scan.sensors_mm is None or cut:
+    if scan.sensors_mm is None or _is_cut_to(box, grid, seen, options):
         placed = build_from_template.solid(template.solid())
         designed_z = HeightField.from_manifold(placed, cell_mm, box_mm=grid.box_mm).z_mm
         designed_z = designed_z[:ny, :nx].astype(np.float64)
         bare = ~seen & (designed_z <= 0)
         z = np.where(bare, 0.0, z)
         known = seen | bare
-        if not cut:
-            solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
+        solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
     z, closed = _close_gaps(z, known, cell_mm, options)
     seen = seen | (closed & ~known)
     known = closed

@@ -35,8 +35,8 @@ def scan_without_bed(solid: m3.Manifold) -> Scan:
     return Scan(points[part], SIGMA_MM, "template", sensors_mm=SENSORS_MM, sensor_index=who[part])
 
 
-def missing_of(scan: Scan) -> Deficit:
-    template = MeshSdf.from_mesh(solid_mesh(PLATE))
+def missing_of(scan: Scan, part: m3.Manifold = PLATE) -> Deficit:
+    template = MeshSdf.from_mesh(solid_mesh(part))
     anomaly = detect(scan, template)
     build = Transform.identity("build", "template")
     return compute_deficit(scan, template, anomaly, build_from_template=build)
@@ -63,6 +63,22 @@ def test_beside_a_part_that_its_scan_was_cut_to_nothing_stands(cut: Scan) -> Non
     assert (field.z_mm[off_y[:, None] | off_x[None, :]] == 0.0).all()
     inside = field.z_mm[np.ix_((y > 2.0) & (y < 12.0), (x > 2.0) & (x < 16.0))]
     assert np.allclose(inside, 3.0, atol=0.1)
+
+
+def test_what_no_ray_reached_beside_what_is_gone_stands_as_designed() -> None:
+    # regression: the foot of a slot 0.6 mm wide stood as high as the part and 1 mm more, though
+    # the wall beside it had stopped below: 0.926 of what was in reach was filled, 0.997 is
+    slot = m3.Manifold.cube((0.6, 20.0, 6.0)).translate((9.4, 0.0, 2.0))
+    part = PLATE + m3.Manifold.cube((12.0, 20.0, 6.0)) - slot
+    part += m3.Manifold.cube((6.0, 20.0, 20.0)).translate((10.0, 0.0, 0.0))
+    scan = scan_without_bed(part - m3.Manifold.cube((26.0, 20.0, 9.0)).translate((0, 0, 16.0)))
+    assert scan.sensor_index is not None
+    # from straight above nobody looked at the slot and what lies behind it
+    seen = scan.subset((scan.sensor_index > 0) | (scan.points_mm[:, 0] > 10.2))
+    field = missing_of(seen, part).as_built
+    x, y = field.centres_mm()
+    above = field.z_mm[np.ix_((y > 2.0) & (y < 18.0), (x > 8.0) & (x < 15.0))]
+    assert above.max() < 16.5
 
 
 def test_where_rays_got_lost_nothing_is_missing(cut: Scan) -> None:
