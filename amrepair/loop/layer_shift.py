@@ -447,7 +447,7 @@ def _worth(log_density: Values, patch: Numbers) -> Values:
     """Of each point, what part of an independent observation it is, of one kind of surface.
 
     Errors that correlate by ρ leave n / (1 + (n - 1) ρ) of a patch's n points (Kish, "Survey
-    Sampling", 1965: the design effect). A log density is the square of an error, and squares of
+    Sampling", 1965, on design effects). A log density is the square of an error, and squares of
     normal errors correlate by ρ²: the share of their variance that lies between patches, as the
     analysis of variance tells it.
     """

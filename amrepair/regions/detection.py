@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import ndtr
 
@@ -139,9 +141,11 @@ def _tested(
 ) -> Tested:
     """Test local means at every scale, and grow regions from the significant places."""
     cells, gone_to = len(seen.surfels), len(seen.surfels) + len(seen.crossed.which)
-    levels = tested(inspected, options, calibration)
+    # a scan alone does not tell its own errors from what the process left
+    alone = replace(options, process_sigma_mm=0.0)
+    levels = tested(inspected, alone if calibration is None else options, calibration)
     if calibration == NORMAL_NOISE and _erratic(levels, options):  # the scan itself contradicts
-        levels, calibration = tested(inspected, options, None), None
+        levels, calibration = tested(inspected, alone, None), None
     # neither a scan nor a calibration tells what errors look like in narrow strips, so strands are
     # looked for only where errors are known to be normal
     strands = np.zeros(len(seen.surfels), bool)

@@ -367,8 +367,6 @@ def _errors(
     few = min(options.least_cells, len(facing)) - 1
     least = float(np.partition(facing, few)[few])
     by_wander = (wander[group] * aslant) ** 2
-    # a scan alone does not tell its own errors from what the process left
-    process_mm = 0.0 if calibration is None else options.process_sigma_mm
     found = []
     for seen_by, pose_mm in zip((views.cell_by, views.window_by), poses_mm, strict=True):
         by_views = np.maximum(views.one_mm**2 / seen_by, np.square(views.here_mm))
@@ -377,7 +375,7 @@ def _errors(
                 np.maximum(np.maximum(by_wander - process_mm2, by_views) - window**2, 0.0)
                 + pose_mm**2
             )
-            for process_mm2 in (process_mm**2, 0.0)
+            for process_mm2 in (options.process_sigma_mm**2, 0.0)
         )
         found.append(Errors(cell, window, common, most, wander, freedom, group, least))
     return found[0], found[1]
