@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import manifold3d as m3
 import numpy as np
@@ -154,23 +155,60 @@ def test_a_job_without_roles_is_placed_by_what_bounds_its_layers() -> None:
     )
 
 
+HALF_MM = 0.225
+SOLID = [8.0 - 2.0 * HALF_MM * k for k in range(18)]  # loops beside each other
+SPARSE = [*SOLID[:2], 5.5, 3.5]
+BORE = SOLID[14]
+
+
+def outermost_of(
+    layers: list[list[float]], *, open_lines: frozenset[float] = frozenset()
+) -> list[set[float]]:
+    """Which square loops of each layer are outermost; half their sides; some lack a side."""
+    corner = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
+    ring = np.vstack([corner, corner[:1]])
+    steps = np.linspace(0.0, 1.0, 9)[:-1]  # a side in eight beads
+    sides = [a + step * (b - a) for a, b in pairwise(ring) for step in steps]
+    around = np.vstack([*sides, corner[:1]])
+    of, layer, ends = [], [], []
+    for k, loops_mm in enumerate(layers):
+        for half_side_mm in loops_mm:
+            path = half_side_mm * around[: 25 if half_side_mm in open_lines else 33]
+            ends.append(np.stack([path[:-1], path[1:]]))
+            of += [half_side_mm] * (len(path) - 1)
+            layer += [k] * (len(path) - 1)
+    start, end = np.concatenate(ends, axis=1)
+    size, none = np.full(len(of), 0.2), np.zeros(len(of), np.int64)
+    beads = Beads(start, end, 0.09 * size / 0.2, 2.25 * size, size, none, np.array(layer), none,
+                  ("unknown",))  # fmt: skip
+    found = outermost(beads, np.ones(len(of), bool), HALF_MM)
+    return [set(np.array(of)[found & (beads.layer == k)].tolist()) for k in range(len(layers))]
+
+
 def test_a_slit_between_loops_is_no_hole_of_the_part() -> None:
     # regression: of a cone with a bore that Slic3r had cut, loops inside lay at the outside; its
     # walls were said to lie 0.106 mm off the part's, and the job was refused as another part's
-    half_mm, inner_mm = 0.225, 5.0
-    loops_mm = [8.0, 7.55, 6.9, 6.45, 6.0, 5.55, inner_mm]  # a slit of 0.2 mm after the second
-    corner = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
-    start = np.concatenate([each * corner for each in loops_mm])
-    end = np.concatenate([each * np.roll(corner, -1, axis=0) for each in loops_mm])
-    steps = np.linspace(0.0, 1.0, 9)[:, None, None]  # a side in eight beads
-    way = end - start
-    ends = [np.swapaxes(start + s * way, 0, 1).reshape(-1, 3) for s in (steps[:-1], steps[1:])]
-    count = len(ends[0])
-    size, none = np.full(count, 0.2), np.zeros(count, np.int64)
-    beads = Beads(*ends, 0.09 * size / 0.2, 2.25 * size, size, none, none, none, ("unknown",))
-    found = outermost(beads, np.ones(count, bool), half_mm)
-    of = np.repeat(loops_mm, 32)
-    assert set(of[found]) == {8.0, inner_mm}
+    loops_mm = [8.0, 7.55, 6.9, 6.45, 6.0, 5.55, 5.0]  # a slit of 0.2 mm after the second
+    assert outermost_of([loops_mm]) == [{8.0, 5.0}]
+
+
+@pytest.mark.parametrize("bored", [range(8), range(5), range(3, 8)])
+def test_infill_in_closed_loops_is_no_wall(bored: range) -> None:
+    """regression: what closed loops alone bound was held to be a hole of the part.
+
+    Half of what was taken for outer walls, of a job of Slic3r, was infill up to 3 mm inside, and
+    the job was refused as another part's.
+    """
+    layers = [
+        [*(SPARSE if 2 <= k < 6 else SOLID[:13]), *(SOLID[13:15] if k in bored else SOLID[13:])]
+        for k in range(8)
+    ]
+    assert outermost_of(layers) == [{8.0, BORE} if k in bored else {8.0} for k in range(8)]
+
+
+def test_infill_that_no_top_covers_is_told_by_its_open_lines() -> None:
+    layers = [SOLID[:15], SOLID[:15], *[[*SPARSE, *SOLID[13:15]]] * 3]
+    assert outermost_of(layers, open_lines=frozenset(SPARSE[2:])) == [{8.0, BORE}] * 5
 
 
 @pytest.mark.slow
