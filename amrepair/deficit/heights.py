@@ -3,8 +3,9 @@
 The slicer lays beads onto it, and the checker keeps the head clear of it. A height is a robust mean
 of the topmost points in a column. A column that no ray reached counts as solid up to the printed
 height and a margin. A cloud without rays cannot tell empty from unseen: where it has no points, the
-part is taken to stand as designed, with that margin, and nothing where it was designed open. Nor
-can one that somebody has cut to its part: rays that ended on the bed beside it are gone.
+part is taken to stand as designed, with that margin, and nothing where it was designed open. Beside
+a part to which somebody has cut its scan nothing stands either, sensors or not: rays that ended on
+the bed are gone. What is too narrow to hide anything is as high as what is beside it.
 """
 
 from __future__ import annotations
@@ -65,14 +66,16 @@ def as_built_heights(
     solid_z = np.full(grid.shape, top_z + options.unseen_margin_mm)
     z, seen = _tops(points, grid, spacing_mm, options)
     known = seen
-    if scan.sensors_mm is None or _is_cut_to(box, grid, seen, options):
+    cut = scan.sensors_mm is not None and _is_cut_to(box, grid, seen, options)
+    if scan.sensors_mm is None or cut:
         placed = build_from_template.solid(template.solid())
         designed_z = HeightField.from_manifold(placed, cell_mm, box_mm=grid.box_mm).z_mm
         designed_z = designed_z[:ny, :nx].astype(np.float64)
         bare = ~seen & (designed_z <= 0)
         z = np.where(bare, 0.0, z)
         known = seen | bare
-        solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
+        if not cut:  # where sensors are known, what stands in front of a place may hide more
+            solid_z = np.minimum(solid_z, designed_z + options.unseen_margin_mm)
     z, closed = _close_gaps(z, known, cell_mm, options)
     seen = seen | (closed & ~known)
     known = closed
@@ -448,18 +451,17 @@ def _neighbours_as_high(top_mm: HeightMap, band_mm: float) -> Int[np.ndarray, "n
 def _close_gaps(
     z_mm: HeightMap, seen: ColumnMask, cell_mm: float, options: HeightOptions
 ) -> tuple[HeightMap, ColumnMask]:
-    """Fill small gaps of sampling: each empty cell takes the height of its highest neighbour.
+    """Fill narrow gaps: each empty cell takes the height of its highest neighbour.
 
     Cell by cell and not gap by gap, since gaps may touch by their corners over some distance, and a
     wall beside one cell is not beside the next.
     """
-    groups, count = ndimage.label(~seen, structure=np.ones((3, 3)))
-    size = np.bincount(groups.ravel(), minlength=count + 1)
-    small = (size <= max(1, int(options.gap_mm2 / cell_mm**2)))[groups] & ~seen
+    side = int(options.gap_mm / cell_mm) + 1
+    narrow = ~seen & ~ndimage.binary_opening(~seen, np.ones((side, side)))
     z_mm, known = z_mm.copy(), seen.copy()
     while True:  # from the rim inwards
         highest = ndimage.maximum_filter(np.where(known, z_mm, -np.inf), 3)
-        new = small & ~known & np.isfinite(highest)
+        new = narrow & ~known & np.isfinite(highest)
         if not new.any():
             return z_mm, known
         z_mm[new] = highest[new]

@@ -65,8 +65,9 @@ class HeightOptions:
         stands beside the part is in it.
     top_band_mm
         Points within this band below a column's topmost point are one surface with its noise.
-    gap_mm2
-        A smaller unseen patch among seen columns is a gap of sampling, in which nothing can hide.
+    gap_mm
+        Where no wider square fits, an unseen patch is a gap of sampling or a slot, out of which
+        nothing stands that would not have been seen, and into which no nozzle goes.
     fine_cell_mm, most_fine_cells
         Width and largest number of columns of the fine field, which has the solids' walls.
     by_wall_cells
@@ -107,7 +108,7 @@ class HeightOptions:
     unseen_margin_mm: float = 1.0
     beside_part_mm: float = 8.0
     top_band_mm: float = 0.3
-    gap_mm2: float = 1.0
+    gap_mm: float = 1.0
     fine_cell_mm: float = 0.1
     most_fine_cells: int = 2_000_000
     by_wall_cells: float = 2.5

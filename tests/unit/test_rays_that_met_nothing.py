@@ -65,7 +65,7 @@ def test_beside_a_part_that_its_scan_was_cut_to_nothing_stands(cut: Scan) -> Non
     assert np.allclose(inside, 3.0, atol=0.1)
 
 
-def test_what_no_ray_reached_beside_what_is_gone_stands_as_designed() -> None:
+def test_a_slot_that_no_ray_reached_stands_no_higher_than_what_is_beside_it() -> None:
     # regression: the foot of a slot 0.6 mm wide stood as high as the part and 1 mm more, though
     # the wall beside it had stopped below: 0.926 of what was in reach was filled, 0.997 is
     slot = m3.Manifold.cube((0.6, 20.0, 6.0)).translate((9.4, 0.0, 2.0))
@@ -79,6 +79,17 @@ def test_what_no_ray_reached_beside_what_is_gone_stands_as_designed() -> None:
     x, y = field.centres_mm()
     above = field.z_mm[np.ix_((y > 2.0) & (y < 18.0), (x > 8.0) & (x < 15.0))]
     assert above.max() < 16.5
+
+
+def test_what_a_wall_hides_stands_as_high_as_the_part_though_the_scan_was_cut_to_it() -> None:
+    # regression: behind a wall all counted as designed, and a blob there stood 5 mm out of it
+    part = PLATE + m3.Manifold.cube((3.0, 20.0, 20.0)).translate((12.0, 0.0, 0.0))
+    blob = m3.Manifold.cube((3.0, 6.0, 6.0)).translate((7.0, 7.0, 3.0))
+    scan = scan_without_bed(part + blob)
+    assert scan.sensor_index is not None
+    field = missing_of(scan.subset(scan.sensor_index == 1), part).as_built
+    x, y = field.centres_mm()
+    assert field.z_mm[np.ix_((y > 7.0) & (y < 13.0), (x > 7.0) & (x < 10.0))].min() >= 9.0
 
 
 def test_where_rays_got_lost_nothing_is_missing(cut: Scan) -> None:
