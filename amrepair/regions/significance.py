@@ -505,7 +505,7 @@ def _level(
     low, high = (_peaks(scale, *each) for each in zip(over, z, strict=True))
     tail = NO_TAIL
     if calibration is None:
-        tail = _tail(scale, over, z, (len(low), len(high)), narrower, options)
+        tail = _tail(scale, over, z, narrower, options)
     for side in (0, 1):
         if calibration is not None:
             width_mm = scale.width_mm if statistic else None
@@ -558,35 +558,41 @@ def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
     return np.sort(peak[np.isfinite(peak)])
 
 
-def _elsewhere(scale: Scale, over: Mask, opposite: int, options: RegionOptions) -> Mask:
+def _elsewhere(scale: Scale, over: Mask, opposite: Mask, options: RegionOptions) -> Mask:
     """(s,) which windows of a side in `over` are no defect's, by the rules of `_outlying`.
 
-    A break is rough, and its windows are many peaks by themselves: those at the place that has the
-    most are left out, but for where enough `opposite` ones lie on the other side.
+    A break is rough, and its windows are many peaks by themselves, some on the other side: those at
+    the place that has the most are left out, but for where enough `opposite` ones lie elsewhere.
     """
-    if options.one_sided * (opposite + 1) >= LEAST_PEAKS or not over.any():
+    if not over.any():
         return over
-    which = np.flatnonzero(over)
-    place = group_points(scale.place_mm[which], reach_mm=scale.width_mm)
-    peaks = np.unique(np.column_stack([place, _groups(scale, over)[which]]), axis=0)
-    elsewhere = over.copy()
-    elsewhere[which] = place != np.bincount(peaks[:, 0]).argmax()
-    return elsewhere
+    place = np.full(len(over), -1)
+    which = np.flatnonzero(over | opposite)
+    place[which] = group_points(scale.place_mm[which], reach_mm=scale.width_mm)
+
+    def peaks(chosen: Mask) -> Numbers:
+        own = np.column_stack([place[chosen], _groups(scale, chosen)[chosen]])
+        return np.asarray(np.unique(own, axis=0)[:, 0])
+
+    most = int(np.bincount(peaks(over)).argmax())
+    others = int((peaks(opposite) != most).sum()) if opposite.any() else 0
+    if options.one_sided * (others + 1) >= LEAST_PEAKS:
+        return over
+    return np.asarray(over & (place != most))
 
 
 def _tail(
     scale: Scale,
     over: Bool[np.ndarray, "2 s"],
     z: Float[np.ndarray, "2 s"],
-    counts: tuple[int, int],
     narrower: Tail,
     options: RegionOptions,
 ) -> Tail:
     """Fit an exponential tail to the peaks over the tolerance that are errors, of both sides.
 
     Errors lie on both sides of the template, so that either tells of the other's; what a defect
-    leaves at one place does not. `counts` is how many peaks each side has. Where too few tell of
-    errors, the `narrower` windows' do: means over more are no outliers more often.
+    leaves at one place does not. Where too few tell of errors, the `narrower` windows' do: means
+    over more are no outliers more often.
 
     Which peaks are errors is found by a forward search, as in Kimber 1982. Peaks that even the
     longest tail would not reach are left out first. The lower half of the rest is taken for errors;
@@ -600,7 +606,7 @@ def _tail(
 
     elsewhere = (
         _elsewhere(scale, mine, opposite, options)
-        for mine, opposite in zip(over, counts[::-1], strict=True)
+        for mine, opposite in zip(over, over[::-1], strict=True)
     )
     both = [_peaks(scale, *each) for each in zip(elsewhere, z, strict=True)]
     told = np.sort(np.concatenate(both))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.stats import norm
 from scipy.stats import t as student
@@ -195,25 +196,45 @@ def test_a_rough_break_at_one_place_is_not_taken_for_errors_of_the_scan(seed: in
     assert {region.label for region in found} == {Label.MISSING}
 
 
+def flat(value_mm: np.ndarray, cell_mm: float) -> Inspected:
+    """A square face, seen as well everywhere, whose cells have these values."""
+    n, count = len(value_mm), value_mm.size
+    across, along = np.meshgrid(np.arange(n) * cell_mm, np.arange(n) * cell_mm, indexing="ij")
+    return Inspected(
+        cells=count, cell_mm=cell_mm,
+        place_mm=np.column_stack([across.ravel(), along.ravel(), np.zeros(count)]),
+        normal=np.tile([0.0, 0.0, 1.0], (count, 1)), value_mm=value_mm.ravel(),
+        weight=np.full(count, 4.0), tolerance_mm=np.full((2, count), 0.2),
+        facing=np.ones(count), pose_mm=np.zeros(count),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("deep_mm", [0.3, 0.4])
+def test_what_stands_out_of_a_rough_break_is_its_own_and_no_error_of_the_scan(
+    deep_mm: float,
+) -> None:
+    # regression: two crests in the break itself counted as errors elsewhere, so that it was the
+    # tail it was held against: nothing was told of one in twelve such breaks on a clean face
+    rng = np.random.default_rng(2)
+    value_mm = rng.normal(0.0, 0.04, (120, 120))
+    rough_mm = ndimage.gaussian_filter(rng.normal(size=(16, 16)), 1.0) * 0.3 / 0.28
+    value_mm[30:46, 30:46] += rough_mm - deep_mm
+    levels = levels_of(flat(value_mm, 0.5), RegionOptions(), None)
+    assert any(level.rejected[0].any() for level in levels)
+
+
 @pytest.mark.parametrize(("deep_mm", "told"), [(0.45, False), (1.5, True)])
 def test_errors_on_one_side_tell_of_those_on_the_other(deep_mm: float, told: bool) -> None:
     # regression: a side with fewer than six peaks was taken for one without outliers, whatever the
     # other side and narrower windows showed
     rng = np.random.default_rng(0)
     n, cell_mm = 120, 0.5
-    across, along = np.meshgrid(np.arange(n) * cell_mm, np.arange(n) * cell_mm, indexing="ij")
     value_mm = rng.normal(0.0, 0.1, (n, n))
     places = rng.permutation(25)[:13]
     for k, high_mm in zip(places, [-deep_mm, *np.linspace(0.25, 0.45, 12)], strict=True):
         row, column = 4 + 24 * (k // 5), 4 + 24 * (k % 5)
         value_mm[row : row + 4, column : column + 4] += high_mm
-    inspected = Inspected(
-        cells=n * n, cell_mm=cell_mm,
-        place_mm=np.column_stack([across.ravel(), along.ravel(), np.zeros(n * n)]),
-        normal=np.tile([0.0, 0.0, 1.0], (n * n, 1)), value_mm=value_mm.ravel(),
-        weight=np.full(n * n, 4.0), tolerance_mm=np.full((2, n * n), 0.2),
-        facing=np.ones(n * n), pose_mm=np.zeros(n * n),
-    )  # fmt: skip
+    inspected = flat(value_mm, cell_mm)
     missing = [level.rejected[0].any() for level in levels_of(inspected, RegionOptions(), None)[1:]]
     assert any(missing) is told
 
