@@ -63,7 +63,7 @@ class Tail:
         Beyond `start` the peaks are exponentially distributed with mean `scale`. A scale of 0 says
         that there is no tail beyond that of normal noise.
     peaks
-        How many such peaks a scan has.
+        How many such peaks a scan has, on both sides together.
     told_by
         How many peaks the scale was estimated from; the fewer, the less certain it is.
     longest
