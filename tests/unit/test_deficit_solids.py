@@ -308,14 +308,15 @@ def test_a_larger_tolerance_finds_no_more() -> None:
 
 
 def test_unseen_cells_are_solid_for_the_nozzle() -> None:
-    scan = rays(BLOCK.body, ABOVE)
+    high_mm = 120.0  # so near that the shadow is no slit, which is too narrow to hide anything
+    scan = rays(BLOCK.body, np.array([[20.0, 15.0, high_mm]]))
     found = deficit_of(scan, BLOCK)
     assert found.as_built.sample(np.array([[20.0, 15.0]]))[0] == pytest.approx(10.0, abs=0.05)
     field = found.as_built
     x, y = np.meshgrid(*field.centres_mm())
     # the block's shadow: a line from the sensor leaves the block at this share of its way
     leaves = 1.0 / np.maximum(np.abs(x - 20.0) / 20.0, np.abs(y - 15.0) / 15.0)
-    shadow_mm = np.clip(300.0 - 290.0 / leaves, 0.0, 10.0)
+    shadow_mm = np.clip(high_mm - (high_mm - 10.0) / leaves, 0.0, 10.0)
     dark = ~field.seen
     assert dark.any()
     assert (field.z_mm[dark] >= shadow_mm[dark] - 0.05).all()
