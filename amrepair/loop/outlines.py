@@ -12,10 +12,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import ndimage
 
 from amrepair.arrays import ColumnMask, Mask, Numbers, PlanePoints
+from amrepair.frames import cells_of
 from gcode.reader import Beads
 from gcode.surfaces.lines import columns_around, heights_by_lines, near_lines
 
@@ -65,9 +66,6 @@ class _Columns(NamedTuple):
             low_mm=self.low_mm, cell_mm=OUTLINE_CELL_MM, shape=self.lowest.shape,
         )  # fmt: skip
 
-    def of_places(self, places_mm: PlanePoints) -> Int[np.ndarray, "n 2"]:
-        return np.floor((places_mm - self.low_mm) / OUTLINE_CELL_MM).astype(np.int64)
-
     def open_from(self, layer: int) -> ColumnMask:
         """Over which no higher layer has a bead, or under which no lower one has."""
         return (self.highest <= layer) | (self.lowest >= layer)
@@ -97,7 +95,8 @@ def outermost(beads: Beads, ours: Mask, half_mm: float) -> Mask:
         infill = columns.covered(start_mm[lines], end_mm[lines])
         outside = _outside(bare, infill, columns.open_from(int(layer)), half_mm)
         away_mm = OUTLINE_CELL_MM * ndimage.distance_transform_edt(~outside)
-        x, y = columns.of_places(0.5 * (start_mm[own] + end_mm[own])).T
+        middle_mm = 0.5 * (start_mm[own] + end_mm[own])
+        x, y = cells_of(middle_mm, columns.low_mm, OUTLINE_CELL_MM).T
         found[which[own]] = away_mm[y, x] < half_mm + 2 * OUTLINE_CELL_MM
     return found
 

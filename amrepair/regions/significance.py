@@ -224,10 +224,9 @@ class Level:
 
     def far_mm(self, start: float) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " q"]]:
         """(p,), (q,) how far beyond the tolerance groups of windows with z above `start` lie."""
-        low, high = (
-            _peaks(self.scale, z > start, beyond_mm)
-            for z, beyond_mm in zip(self.z, self.beyond_mm, strict=True)
-        )
+        over = self.z > start
+        groups = [_groups(self.scale, each) for each in over]
+        low, high = (_peaks(*each) for each in zip(groups, over, self.beyond_mm, strict=True))
         return low, high
 
     @property
@@ -502,10 +501,11 @@ def _level(
     log_p = np.log(n * ways) + together * log_ndtr(-safe)
     far_off_mm = np.zeros(2)
     over = (z > options.tail_from) & ~scale.apart
-    low, high = (_peaks(scale, *each) for each in zip(over, z, strict=True))
+    groups = [_groups(scale, each) for each in over]
+    low, high = (_peaks(*each) for each in zip(groups, over, z, strict=True))
     tail = NO_TAIL
     if calibration is None:
-        tail = _tail(scale, over, z, narrower, options)
+        tail = _tail(scale, over, groups, z, narrower, options)
     for side in (0, 1):
         if calibration is not None:
             width_mm = scale.width_mm if statistic else None
@@ -550,32 +550,30 @@ def _groups(scale: Scale, chosen: Mask) -> Numbers:
     return connected(window[beside], cell[beside], len(chosen))
 
 
-def _peaks(scale: Scale, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
-    """(p,) the highest value of each connected group of the windows in `over`, in rising order."""
-    group = _groups(scale, over)
+def _peaks(group: Numbers, over: Mask, value: Values) -> Float[np.ndarray, " p"]:
+    """(p,) the highest value of each group of the windows in `over`, in rising order."""
     peak = np.full(len(value), -np.inf)
     np.maximum.at(peak, group[over], value[over])
     return np.sort(peak[np.isfinite(peak)])
 
 
-def _elsewhere(scale: Scale, over: Mask, opposite: Mask, options: RegionOptions) -> Mask:
+def _elsewhere(
+    over: Mask,
+    place: Numbers,
+    own: Int[np.ndarray, " p"],
+    opposite: Int[np.ndarray, " q"],
+    options: RegionOptions,
+) -> Mask:
     """(s,) which windows of a side in `over` are no defect's, by the rules of `_outlying`.
 
     A break is rough, and its windows are many peaks by themselves, some on the other side: those at
     the place that has the most are left out, but for where enough `opposite` ones lie elsewhere.
+    `place` is that of each window, `own` and `opposite` those of the sides' peaks.
     """
-    if not over.any():
+    if not len(own):
         return over
-    place = np.full(len(over), -1)
-    which = np.flatnonzero(over | opposite)
-    place[which] = group_points(scale.place_mm[which], reach_mm=scale.width_mm)
-
-    def peaks(chosen: Mask) -> Numbers:
-        own = np.column_stack([place[chosen], _groups(scale, chosen)[chosen]])
-        return np.asarray(np.unique(own, axis=0)[:, 0])
-
-    most = int(np.bincount(peaks(over)).argmax())
-    others = int((peaks(opposite) != most).sum()) if opposite.any() else 0
+    most = int(np.bincount(own).argmax())
+    others = int((opposite != most).sum())
     if options.one_sided * (others + 1) >= LEAST_PEAKS:
         return over
     return np.asarray(over & (place != most))
@@ -584,6 +582,7 @@ def _elsewhere(scale: Scale, over: Mask, opposite: Mask, options: RegionOptions)
 def _tail(
     scale: Scale,
     over: Bool[np.ndarray, "2 s"],
+    groups: list[Numbers],
     z: Float[np.ndarray, "2 s"],
     narrower: Tail,
     options: RegionOptions,
@@ -604,11 +603,18 @@ def _tail(
     def reach(count: int) -> float:
         return start + longest * float(np.log(max(count, 1) / options.false_regions))
 
+    place = np.full(len(scale), -1)
+    which = np.flatnonzero(over.any(axis=0))
+    place[which] = group_points(scale.place_mm[which], reach_mm=scale.width_mm)
+    at = [
+        place[mine][np.unique(group[mine], return_index=True)[1]]
+        for mine, group in zip(over, groups, strict=True)
+    ]
     elsewhere = (
-        _elsewhere(scale, mine, opposite, options)
-        for mine, opposite in zip(over, over[::-1], strict=True)
+        _elsewhere(mine, place, own, opposite, options)
+        for mine, own, opposite in zip(over, at, at[::-1], strict=True)
     )
-    both = [_peaks(scale, *each) for each in zip(elsewhere, z, strict=True)]
+    both = [_peaks(*each) for each in zip(groups, elsewhere, z, strict=True)]
     told = np.sort(np.concatenate(both))
     while len(told) and told[-1] > reach(len(told)):
         told = told[:-1]
